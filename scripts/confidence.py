@@ -5,7 +5,8 @@ python scripts/confidence.py --presses ../shared/data/gelsight_mini_a --sensor g
 python scripts/confidence.py --drawn 700 701 702 703 704 705 706 707
 python scripts/confidence.py --sets gelsight_mini_a gelsight_mini_b gelsight_mini_c gelsight_pale digit_a
 
-The second and third: objects inside and outside of the range of slopes and depths that the calibration's presses taught.
+The second: objects inside and outside of the range of slopes and depths of the calibration's presses. The third: real sets by 1 to
+12 presses, and frames of other cameras.
 
 Random exact scenes of four kinds of units, and presses of balls that calibration has not seen.
 """

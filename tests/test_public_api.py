@@ -27,7 +27,7 @@ def test_public_names_are_frozen():
 def test_results_have_their_fields_in_order():
     assert vts.DepthOutput._fields == ("depth_mm", "gradient", "normal", "contact", "deformed")
     assert ConfidentOutput._fields[:5] == vts.DepthOutput._fields
-    assert ConfidentOutput._fields[5:] == vts.pipeline.confidence.Bounds._fields
+    assert ConfidentOutput._fields[5:] == ("normal_95_deg", "depth_95_mm", "confidence", "frame_confidence", "factors_deg")
     assert {"lights", "converged", "loss_history", "direction_std_deg", "message"} <= set(LightFit.__dataclass_fields__)
 
 

@@ -34,7 +34,7 @@ MODULES = {
     "scenes.": vts.scenes,
 }
 RECORDS = {
-    "Bounds", "Calibration", "CalibrationWarning", "Conditions", "ConfidentOutput", "DepthOutput", "Diagnosis", "Diagnosis.of",
+    "Calibration", "CalibrationWarning", "Conditions", "ConfidentOutput", "DepthOutput", "Diagnosis", "Diagnosis.of",
     "DiscontinuitySolution", "Finding", "LightFit", "MlpFit", "Registration", "Result", "export.ExportCheck", "export.Format",
     "gs_sdk.GsSdkFolder", "gs_sdk.GsSdkPress", "objects.Target", "scenes.Scene",
     "stream.Reader", "stream.TactileFrame", "stream.Unreadable",
@@ -52,7 +52,7 @@ PARTS = {
     "stream.TactileStream.rezero", "stream.VideoFile.", "stream.find_camera", "stream.frames_a_second", "stream.has_screen",
     "read_result", "stream.check_device", "stream.read_background", "stream.read_press_images", "stream.require_rerun",
     "stream.use_calibration", "stream.video_codec", "stream.with_background", "unit_pipeline", "unseen_deg", "usual_unseen_deg",
-    "stated_deg", "stated_error_deg", "with_preprocessing", "write_point_cloud",
+    "StatedError", "StatedError.", "stated_deg", "stated_error_deg", "with_preprocessing", "write_point_cloud",
 }  # fmt: skip
 """Names, and with a dot at the end methods, that other tests cover: records, base classes, what one room does for another."""
 FREE = {"dtype", "seed", "report", "comment", "clock", "sleep"}

@@ -1,5 +1,7 @@
 """Pictures of frames: depth as contours and as a shaded surface, errors, registered clouds; made without a display."""
 
+import math
+import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -10,11 +12,18 @@ from matplotlib import patheffects
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import LightSource, LinearSegmentedColormap, ListedColormap, Normalize
 from matplotlib.figure import Figure
+from matplotlib.patches import Circle
 from matplotlib.ticker import MaxNLocator
 from torch import Tensor
 
+from .calibration import Press
+from .calibration.contacts import INSIDE
 from .core.checks import check_same_size
 from .core.files import write_atomically
+from .model import Calibration
+from .model.report import PressRow
+from .model.stated_error import error_over_skin
+from .pipeline import DepthPipeline
 
 Array = np.ndarray[Any, Any]
 
@@ -33,6 +42,9 @@ _MAP = LinearSegmentedColormap.from_list(
 
 SOURCE, TARGET = "#d55e00", "#0072b2"
 """Colours of the two clouds of a pose; blue and vermilion, which all readers distinguish."""
+
+PRESSES_SHOWN = 6
+"""Presses in the picture of a calibration."""
 
 MOST_POINTS = 220
 """Largest number of points of a surface in each direction."""
@@ -300,6 +312,89 @@ def pose_figure(source: Tensor, target: Tensor, T_target_source: Tensor, title: 
     if title:
         figure.suptitle(title, fontsize=11)
     return figure
+
+
+def calibration_figure(calibration: Calibration, presses: Sequence[Press]) -> Figure:
+    """What a calibration was made of: the background with the balls where they were found, the error of normals that it states over
+    the skin, up to :data:`PRESSES_SHOWN` presses beside what they leave, and all doubts.
+
+    Args:
+        calibration: of the unit.
+        presses: that were given; those of the report are drawn.
+    """
+    rows = {row["name"]: row for row in calibration.report.get("presses", []) if "center_px" in row}
+    shown = [press for press in presses if press.name in rows]
+    shown = shown[:: max(1, -(-len(shown) // PRESSES_SHOWN))]
+    doubts = calibration.report.get("doubts") or ["no doubts"]
+    text = "\n".join("\n".join(textwrap.wrap(doubt, 150, subsequent_indent="    ")) for doubt in doubts)
+    height, width = calibration.background.shape[1:]
+    lines, side = -(-len(shown) // 2), 2.35 * min(1.4, height / width)
+    figure = new_figure(10.4, (lines + 1) * (side + 0.35) + 0.3 + 0.17 * (text.count("\n") + 1))
+    ratios = ((lines + 1) * (side + 0.35), 0.3 + 0.17 * (text.count("\n") + 1))
+    top, bottom = np.ravel(figure.subfigures(2, 1, height_ratios=ratios))
+    bottom.text(0.01, 0.98, text, fontsize=8, va="top")
+    axes = top.subplots(lines + 1, 4, squeeze=False)
+    for panel in axes.flat:
+        panel.set_axis_off()
+    axes[0, 0].imshow(_picture(calibration.background_value))
+    axes[0, 0].set_title("background, balls found", fontsize=9)
+    for row in rows.values():
+        _circle(axes[0, 0], row)
+    if (error := error_over_skin(calibration)) is not None:
+        drawn = axes[0, 1].imshow(error.numpy(), cmap="cividis", vmin=0.0, extent=(-0.5, width - 0.5, height - 0.5, -0.5))
+        axes[0, 1].set_title("normals: error expected, degrees", fontsize=9)
+        figure.colorbar(drawn, ax=axes[0, 1], shrink=0.8)
+        for row in rows.values():
+            _circle(axes[0, 1], row)
+    axes[0, 2].text(0.0, 1.0, _facts(calibration), fontsize=9, va="top", transform=axes[0, 2].transAxes)
+    for k, press in enumerate(shown):
+        image, left = axes[1 + k // 2, 2 * (k % 2)], axes[1 + k // 2, 2 * (k % 2) + 1]
+        row = rows[press.name]
+        off, inner = _left_deg(calibration, press, row), _left_deg(calibration, press, row, INSIDE)
+        image.imshow(_picture(press.image))
+        _circle(image, row)
+        image.set_title(press.name if row["used"] else f"{press.name}, left out", fontsize=9)
+        drawn = left.imshow(off, cmap="cividis", vmin=0.0, vmax=10.0)
+        left.set_title(f"normals off the ball's: {np.nanmean(inner):.1f} degrees", fontsize=9)
+        _circle(left, row)
+        figure.colorbar(drawn, ax=left, shrink=0.8)
+    return figure
+
+
+def _facts(calibration: Calibration) -> str:
+    report = calibration.report
+    errors = [(key, report.get(f"{key}_deg")) for key in ("own", "held_out", "stated")]
+    figures = [f"{key.replace('_', ' ')}: {value:.2f} degrees" for key, value in errors if isinstance(value, float)]
+    return "\n".join(
+        [*textwrap.wrap(str(report.get("reason", "")), 46), *figures, "metric" if calibration.metric else "NOT METRIC"]
+    )
+
+
+def _picture(image: Tensor) -> Array:
+    picture: Array = image.detach().cpu().permute(1, 2, 0).clamp(0, 1).float().numpy()
+    return picture
+
+
+def _circle(axes: Any, row: PressRow) -> None:
+    color, style = ("white", "-") if row["used"] else ("#f1a340", "--")
+    drawn = axes.add_patch(Circle(row["center_px"], row["contact_radius_px"], fill=False, color=color, linestyle=style))
+    drawn.set_path_effects(_HALO)
+
+
+def _left_deg(calibration: Calibration, press: Press, row: PressRow, share: float = 1.0) -> Array:
+    """(H, W): angle between the normals found and the ball's within a share of its contact radius, degrees; NaN elsewhere."""
+    pitch_mm, radius_mm = calibration.sensor.mm_per_pixel, 0.5 * press.ball_diameter_mm
+    with torch.no_grad():
+        out = DepthPipeline.from_calibration(calibration, "fast")(press.image.detach().cpu().to(calibration.background.dtype)[None])
+    height, width = press.image.shape[1:]
+    x = (torch.arange(width) - row["center_px"][0]) * pitch_mm / radius_mm
+    y = (torch.arange(height)[:, None] - row["center_px"][1]) * pitch_mm / radius_mm
+    square = x.square() + y.square()
+    ball = torch.stack((x.expand(height, width), y.expand(height, width), (1.0 - square).clamp_min(0.0).sqrt()))
+    angle = torch.rad2deg(torch.acos((out.normal[0] * ball).sum(0).clamp(-1.0, 1.0)))
+    inside = square < (share * row["contact_radius_px"] * pitch_mm / radius_mm) ** 2
+    left: Array = angle.masked_fill(~inside, math.nan).numpy()
+    return left
 
 
 def save_figure(figure: Figure, path: str | Path) -> None:

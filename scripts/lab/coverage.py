@@ -2,11 +2,12 @@
 
 import math
 import random
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import torch
+from torch import Tensor
 from tqdm import tqdm
 
 from torchvts.calibration import Press
@@ -23,7 +24,7 @@ from .drawn_sensors import DrawnPress, drawn_sensor
 from .metrics import normal_angle_deg
 from .random_scenes import random_frame
 from .rows import Column, Row, error_column
-from .sets import Fold, Target, from_folder, load, truth_of
+from .sets import Target, from_folder, load, truth_of
 
 LEVELS = (0.5, 0.68, 0.8, 0.9, 0.95)
 """Probabilities at which coverage is measured."""
@@ -34,8 +35,9 @@ def coverage(out: ConfidentOutput, truth: Truth, spread: float, name: str = "", 
 
     Returns:
         A row of unit or press ``name`` and the shape that was pressed in, with the errors "normal 50%", "depth 50%" and so on,
-        "deg" (mean angle) and "stated" (mean angle that the bounds state over the actual one). ``relief`` compares depth less
-        its mean.
+        "deg" (mean angle), "stated" (mean angle that the bounds state over the actual one), "confidence" of the frame, and "sure,
+        and wrong": 100 where that is above 80 and fewer than 60 % of the normals lie within their 95 % bounds. ``relief``
+        compares depth less its mean.
     Raises:
         ValueError: an empty region.
     """
@@ -50,6 +52,8 @@ def coverage(out: ConfidentOutput, truth: Truth, spread: float, name: str = "", 
     for kind, (error, bound, width) in bounds.items():
         for level in LEVELS:
             errors[f"{kind} {level:.0%}"] = 100.0 * float((error <= bound_at(bound, level, width)).double().mean())
+    sure = float(out.frame_confidence)
+    errors |= {"confidence": 100.0 * sure, "sure, and wrong": 100.0 * float(sure > 0.8 and (errors["normal 95%"] or 0.0) < 60.0)}
     per_bound = math.gamma(1.0 + 0.5 * spread) / math.log(20.0) ** (0.5 * spread)  # the mean of the distribution of bound_at
     errors["stated"] = per_bound * float(bounds["normal"][1].mean()) / float(angle.mean())
     return Row("coverage", shape, name, errors)
@@ -114,6 +118,8 @@ def mean(rows: Sequence[Row], name: str = "") -> Row:
         shares = torch.tensor([row.errors[key] for row in rows], dtype=torch.float64)
         low, high = shares.quantile(torch.tensor([0.25, 0.75], dtype=torch.float64)).tolist()
         errors |= {key: float(shares.mean()), f"{key}, lower quartile": low, f"{key}, upper quartile": high}
+    for key in ("confidence", "sure, and wrong"):
+        errors[key] = sum(row.errors[key] or 0.0 for row in rows) / len(rows)
     degrees = [row.errors["deg"] or 0.0 for row in rows]
     errors["deg"] = sum(degrees) / len(rows)
     # of sums: a frame that is nearly exact has no meaningful ratio
@@ -168,31 +174,56 @@ def _cone(slope: float) -> solids.Height:
     return lambda u, v: -slope * torch.sqrt(u * u + v * v + 1e-8)
 
 
+COUNTS = (0, 1, 2, 3, 5, 8, 12)
+"""Presses that real sets are calibrated by; 0 where there is a prior."""
+
+SCORED = 5
+"""Presses that are scored of each calibration."""
+
+CAMERAS: dict[str, Callable[[Tensor], Tensor]] = {
+    "gamma 0.7": lambda image: image**0.7,
+    "gamma 1.5": lambda image: image**1.5,
+    "saturation 0.5": lambda image: 0.5 * (image + image.mean(0, keepdim=True)),
+    "saturation 0.7": lambda image: 0.7 * image + 0.3 * image.mean(0, keepdim=True),
+    "gain 0.6": lambda image: 0.6 * image,
+    "gain 2.5": lambda image: (2.5 * image).clamp(0.0, 1.0),
+    "R and B swapped": lambda image: image[[2, 1, 0]],
+    "no R": lambda image: image * torch.tensor([0.0, 1.0, 1.0]).reshape(3, 1, 1),
+}
+"""Cameras that are not as at calibration; two frames by five presses, or by the prior, are seen by each."""
+
+
 def of_set(name: str, data: Path, mode: str = "precise") -> list[Row]:
-    """Coverage on a real set by its folds, and of the presses of larger contact radii by those of smaller ones, without a prior."""
-    loaded, rows = load(name, data), []
-    folds = [(name, fold) for fold in loaded.folds]
-    scored = {target.name: target for fold in loaded.folds for target in fold.scored if target.ball is not None}
+    """Coverage on a real set that is calibrated by a few of its presses, drawn at random, without labels: without a prior, and with
+    one that has not seen the presses that are scored."""
+    loaded, draw, rows = load(name, data), random.Random(7), []
     learned = {press.name: press for fold in loaded.folds for press in fold.learned}
-    ranked = sorted((key for key in scored if key in learned), key=lambda key: _flatness(scored[key]))
-    if len(ranked) >= 8:
-        half = len(ranked) // 2
-        smaller = [learned[key] for key in ranked[:half]]
-        larger = [scored[key] for key in ranked[half:]]
-        folds.append((f"{name}, larger by smaller presses", Fold(loaded.folds[0].sensor.without_prior(), smaller, larger)))
-    for title, fold in folds:
-        pipe = ConfidentPipeline.from_calibration(Training(loaded.background, fold.learned, fold.sensor).calibration, mode)
-        for target in fold.scored:
-            if target.truth is not None and bool(target.truth.region.any()):
-                with torch.inference_mode():
-                    out = pipe(target.image[None])
-                rows.append(coverage(out, target.truth, pipe.confidence.spread, title, relief=target.ball is not None))
+    by_prior = {id(fold.sensor.prior): fold.sensor for fold in loaded.folds}
+    for sensor in [loaded.folds[0].sensor.without_prior(), *(one for one in by_prior.values() if one.prior is not None)]:
+        folds = [fold for fold in loaded.folds if sensor.prior is None or fold.sensor.prior is sensor.prior]
+        names = sorted({press.name for fold in folds for press in fold.learned})
+        targets = [t for fold in folds for t in fold.scored if t.truth is not None and bool(t.truth.region.any())]
+        for count in COUNTS:
+            if count > max(0, len(names) - 2) or (count == 0 and sensor.prior is None):
+                continue
+            some = draw.sample(names, count)
+            unit = Training(loaded.background, [learned[one] for one in some], sensor).calibration
+            pipe = ConfidentPipeline.from_calibration(unit, mode)
+            rest = [target for target in targets if target.name not in some]
+            rest = draw.sample(rest, min(SCORED, len(rest)))
+            title = f"{count} presses{', prior' if sensor.prior is not None else ''}"
+            rows += [_row_of_target(pipe, target, target.image, name, title) for target in rest]
+            if count in (0, 5):
+                seen = [(target, kind, change(target.image)) for kind, change in CAMERAS.items() for target in rest[:2]]
+                rows += [_row_of_target(pipe, target, image, "another camera", kind) for target, kind, image in seen]
     return rows
 
 
-def _flatness(target: Target) -> float:
-    assert target.ball is not None
-    return (target.ball.contact_radius_px or 0.0) / target.ball.ball_diameter_mm
+def _row_of_target(pipe: ConfidentPipeline, target: Target, image: Tensor, title: str, shape: str) -> Row:
+    assert target.truth is not None
+    with torch.inference_mode():
+        out = pipe(image[None])
+    return coverage(out, target.truth, pipe.confidence.spread, title, shape, relief=target.ball is not None)
 
 
 def range_table(rows: Sequence[Row]) -> str:
@@ -203,4 +234,6 @@ def range_table(rows: Sequence[Row]) -> str:
     columns = [Column("", lambda row: row.data), Column("object", lambda row: row.method), error_column("deg", "deg", 2)]
     columns += [error_column(f"{kind}s within 95 %", f"{kind} 95%", 1) for kind in ("normal", "depth")]
     means = [replace(mean(some, data), method=shape) for (data, shape), some in groups.items()]
-    return records.table(means, [*columns, error_column("stated / actual", "stated", 2)])
+    columns += [error_column("stated / actual", "stated", 2)]
+    columns += [error_column("confidence %", "confidence", 0), error_column("sure and wrong, % of frames", "sure, and wrong", 1)]
+    return records.table(means, columns)

@@ -10,8 +10,7 @@ import torch
 import torchvts as vts
 from lab.drawn_sensors import drawn_sensor
 from torchvts.calibration import CalibrationWarning
-from torchvts.model import distance_to_presses, press_next
-from torchvts.pipeline import beyond_presses
+from torchvts.model import press_next, stated_error_deg
 
 UNIT = drawn_sensor(0)
 
@@ -100,16 +99,14 @@ def test_the_order_of_presses_does_not_matter(whole):
     assert torch.allclose(ours, theirs, atol=1e-6)
 
 
-def test_skin_without_presses_is_known_and_said(whole):
+def test_skin_without_presses_is_known_and_said():
     left = [press for press in bare(UNIT.balls) if dict(places())[press.name][0] < UNIT.sensor.width / 2]
     calibration, _ = calibrate(UNIT.sensor, left)
-    share, place = press_next(calibration)
-    assert share < 0.7 and place is not None and place[0] > UNIT.sensor.width / 2
-    assert float(distance_to_presses(calibration)[place[1], place[0]]) > 1.5
-    assert press_next(whole[0])[0] > share
-    right = [press for press in UNIT.balls if press.center_px[0] > 0.75 * UNIT.sensor.width]
-    out = vts.DepthPipeline.from_calibration(calibration)(right[0].image[None])
-    assert "of the contact where no ball was pressed" in beyond_presses(calibration, out)[0]
+    place, error_deg = press_next(calibration)
+    assert place[0] > UNIT.sensor.width / 2
+    assert error_deg > calibration.report["own_deg"]
+    there = stated_error_deg(calibration, torch.full((1, 3, UNIT.sensor.height, UNIT.sensor.width), 1.2))[0, 0, place[1]]
+    assert float(there[place[0]]) > 1.2 * float(there[UNIT.sensor.width // 4])
 
 
 def places():

@@ -5,7 +5,6 @@ All that triggers stands in :data:`TRIGGERS`, all that must not in :data:`ORDINA
 
 import dataclasses
 import json
-import math
 import warnings
 
 import pytest
@@ -20,7 +19,7 @@ from torchvts import scenes
 from torchvts.core.blur import blur, gaussian_weights
 from torchvts.diagnose import Diagnosis, Finding
 from torchvts.diagnose.checks import CHECKS
-from torchvts.model.response_field import ResponseModel, TaughtRange
+from torchvts.model.response_field import ResponseModel
 from torchvts.training.presses import Training
 
 SIZE = {"height": 120, "width": 160, "mm_per_pixel": 0.25}
@@ -109,12 +108,12 @@ def softened(image, seed):
     return blur(image[None], gaussian_weights(1.5))[0] + noise
 
 
-def deeper_than_learned(seed, depth_mm=10.0):
+def little_known(seed):
     unit = drawn_sensor(31)
     balls = [unit.ball(5.0, 0.3 + 0.2 * k, (0.5 * k - 1.0, 0.3 * k - 0.5), f"{k}", k) for k in range(4)]
     calibration = vts.calibrate(unit.background, unit.sensor, balls)
-    narrow = dataclasses.replace(calibration.response, taught=TaughtRange(math.sin(math.radians(5.0)), depth_mm, 0.5))
-    return None, unit.ball(5.0, 0.7, (0.5, 0.5), "other", seed).image, dataclasses.replace(calibration, response=narrow)
+    unsure = dataclasses.replace(calibration, covariance=100.0 * calibration.covariance)
+    return None, unit.ball(5.0, 0.7, (0.5, 0.5), "other", seed).image, unsure
 
 
 TRIGGERS = {
@@ -162,7 +161,7 @@ TRIGGERS = {
     "faint_contact": gallery("faint contact", 0.05),
     "steep_walls": gallery("steep walls", 4.0),
     "steep_walls, cut ends": gallery("cut ends", 3.0),
-    "beyond_presses": deeper_than_learned,
+    "beyond_presses": little_known,
     "shadow": gallery("attached shadows", 30.0),
     "cast_shadow": gallery("cast shadows", 30.0),
     "deep_press": gallery("deeper press", 3.0),
@@ -190,12 +189,6 @@ def triggered(name, seed):
 def test_every_finding_has_a_frame_that_triggers_it(name):
     hit, found = triggered(name, seed=7)
     assert hit, str(found)
-
-
-def test_a_contact_four_times_as_deep_as_the_presses_is_a_warning():
-    for depth_mm, severity in ((10.0, "note"), (0.1, "warning")):
-        found = vts.diagnose(*deeper_than_learned(0, depth_mm))
-        assert [finding.severity for finding in found if finding.name == "beyond_presses"] == [severity]
 
 
 def test_every_finding_of_the_table_is_triggered():

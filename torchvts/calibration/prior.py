@@ -1,7 +1,6 @@
 """Fit the prior of a sensor type, and measure how good it is on presses that it was not fitted to."""
 
 import dataclasses
-import functools
 import warnings
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -11,7 +10,7 @@ from torch import Tensor
 
 from ..core.checks import check_image, check_record, check_sequence
 from ..model.calibration import Calibration
-from ..model.response_field import ResponseField, ResponseModel, SensorPrior, TaughtRange, fit_log_background
+from ..model.response_field import ResponseField, ResponseModel, SensorPrior, fit_log_background
 from ..model.sensor import Sensor, check_sensor
 from .by_presses import by_presses
 from .contacts import Contact, used
@@ -20,7 +19,7 @@ from .field import Family, power_of
 from .given_images import sort_presses
 from .posterior import Evidence, Prior, mean_error_deg
 from .presses import Press, check_presses
-from .response_fit import FEW, fit_depth_brightness, taught_range
+from .response_fit import FEW, fit_depth_brightness
 
 DEGREES = (2, 1)
 """Degrees of a type's field in position, of linear terms and of products of two. Of two pairs of units, each by the other, without
@@ -118,16 +117,14 @@ def _pattern(own: Sensor, found: Calibration, sensor: Sensor) -> Tensor:
 
 
 def _model(field: ResponseField, balls: list[list[Contact]], units: list[PriorUnit], first: Calibration) -> ResponseModel:
-    """The field with the mean over units of what depth does to brightness, and all that their presses taught."""
+    """The field with the mean over units of what depth does to brightness."""
     assert first.response is not None
     pairs = list(zip(balls, (unit.sensor.mm_per_pixel for unit in units), strict=True))
     by_depth = [fit_depth_brightness(own, field, pitch_mm) for own, pitch_mm in pairs]
     rows = torch.stack([depth.tensor() for depth in by_depth]).mean(0).tolist()
     reference_mm = sum(depth.reference_mm for depth in by_depth) / len(by_depth)
     mean = dataclasses.replace(by_depth[0], coefficient=tuple(map(tuple, rows)), reference_mm=reference_mm)
-    ranges = [taught_range(own, field, pitch_mm) for own, pitch_mm in pairs]
-    taught = functools.reduce(TaughtRange.with_all_of, ranges)
-    return ResponseModel(field, mean, first.response.gamma, first.response.blur_px, taught)
+    return ResponseModel(field, mean, first.response.gamma, first.response.blur_px)
 
 
 def score_prior(background: Tensor, sensor: Sensor, presses: Sequence[Press]) -> float:

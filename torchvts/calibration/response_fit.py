@@ -1,4 +1,4 @@
-"""Fit a response model to located presses: the field's posterior, what depth does to brightness, and what the presses taught."""
+"""Fit a response model to located presses: the field's posterior, and what depth does to brightness."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -7,13 +7,11 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from ..core.geometry import lengths
 from ..model.response_field import (
     DepthBrightness,
     ResponseField,
     ResponseModel,
     SensorPrior,
-    TaughtRange,
     position_basis,
     term_values,
 )
@@ -37,12 +35,6 @@ comes 1 mm nearer to lights about 10 mm away changes its brightness by about 0.1
 DEPTH_PENALTY_ON_PRIOR = 3.0
 """The same towards a prior, from which units of a type differ by about 0.03 per mm, and the error of a press is alike all over it,
 so that its pixels do not average it: (0.05 / 0.03)^2."""
-
-TAUGHT_SHARE = 0.95
-"""Share of the presses' pixels that are no steeper, and no deeper, than the range that was taught."""
-
-FLATTER_PART = 0.7
-"""Part of that range to which a field is fitted to see how it does beyond."""
 
 STEEPER = 1.0
 """``steeper`` of a :class:`DepthBrightness`, times half the longer side of the image: 3 h / d^2 of lights 1.2 to 1.6 times that
@@ -99,11 +91,8 @@ def fit_response(contacts: list[Contact], sensor: Sensor, prior: SensorPrior | N
         bar.update()
         bar.set_postfix(step="depth")
         by_depth = fit_depth_brightness(presses, found.field, pitch, None if prior is None else prior.response.by_depth)
-        taught = taught_range(presses, found.field, pitch)
-        if prior is not None and prior.response.taught is not None:
-            taught = taught.with_all_of(prior.response.taught)
         bar.update()
-    model = ResponseModel(found.field, by_depth, sensor.exponent, sensor.blur_px, taught)
+    model = ResponseModel(found.field, by_depth, sensor.exponent, sensor.blur_px)
     stated = _stated_anywhere(found, presses, own_deg)
     return ResponseFit(model, found.covariance, own_deg, held_out_deg, stated)
 
@@ -157,36 +146,6 @@ def fit_depth_brightness(
     steeper = STEEPER / float(contacts[0].half_size_mm.max())
     rows = tuple(tuple(row) for row in found.tolist())
     return DepthBrightness(DEPTH_DEGREE, field.half_mm, rows, steeper, _mean_depth(contacts, depths))
-
-
-def taught_range(contacts: list[Contact], field: ResponseField, pitch_mm: float) -> TaughtRange:
-    """How steep and how deep located presses are, and how fast a field of this size errs beyond what it was fitted to.
-
-    The error beyond is measured: a field fitted to the flatter part of the presses is scored on their rims.
-
-    Args:
-        contacts: of presses.
-        field: fitted to them.
-        pitch_mm: pixel pitch, mm.
-    """
-    depths = [
-        depth.flatten()[contact.index[contact.inside()]]
-        for contact, depth in zip(contacts, first_pass_depths(contacts, field, pitch_mm))
-    ]
-    family = Family.of(field)
-    terms = [family.terms(contact)[:, contact.inside()] for contact in contacts]
-    sines = [ball_sine(contact)[:, contact.inside()] for contact in contacts]
-    steepest = float(lengths(torch.cat(sines, 1), 0).quantile(TAUGHT_SHARE))
-    deepest = float(torch.cat(depths).clamp_min(0.0).quantile(TAUGHT_SHARE))
-    limit = FLATTER_PART * steepest
-    flatter = [lengths(sine, 0) < limit for sine in sines]
-    gram = sum(t[:, k] @ t[:, k].t() / max(1, int(k.sum())) for t, k in zip(terms, flatter))
-    right = sum(t[:, k] @ s[:, k].t() / max(1, int(k.sum())) for t, s, k in zip(terms, sines, flatter))
-    by_flatter = torch.linalg.solve(gram + torch.diag(prior_of(family, contacts).precision), right)
-    off = torch.cat([(by_flatter.t() @ t - s)[:, ~k] for t, s, k in zip(terms, sines, flatter)], 1)
-    beyond = lengths(torch.cat([s[:, ~k] for s, k in zip(sines, flatter)], 1), 0) - limit
-    growth = float((off.square().sum() / beyond.square().sum().clamp_min(1e-12)).sqrt())
-    return TaughtRange(steepest, deepest, growth)
 
 
 def _mean_depth(contacts: list[Contact], depths: list[Tensor]) -> float:

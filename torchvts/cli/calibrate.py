@@ -17,9 +17,11 @@ from pathlib import Path
 import torch
 
 from ..calibration import Press, read_presses
+from ..calibration.presses import check_presses
 from ..core.files import make_folder, read_frames
 from ..model import Sensor
 from ..stream import read_background, read_press_images
+from ..viz import calibration_figure, save_figure
 from .options import add_background_frames, add_press, add_sensor, cut_frames, load_sensor
 from .parser import UsageError
 from .summary import calibrated, print_calibration
@@ -60,8 +62,10 @@ def run(arguments: argparse.Namespace) -> int:
     presses += read_press_images(arguments.press, sensor)
     calibration = calibrated(image, sensor, presses, arguments.force)
     calibration.save(arguments.out)
+    picture = arguments.out.with_suffix(".png")
+    save_figure(calibration_figure(calibration, check_presses(presses, sensor)), picture)
     print_calibration(calibration, arguments.candidates)
-    print(f"wrote {arguments.out} ({arguments.out.stat().st_size / 1000:.0f} kB)")
+    print(f"wrote {arguments.out} ({arguments.out.stat().st_size / 1000:.0f} kB), and {picture}: what it was made of")
     return 0
 
 

@@ -21,8 +21,6 @@ from tqdm import tqdm
 from ..core.files import VIDEO_SUFFIXES, make_folder, read_frames
 from ..dataset import CLOUD_FORMATS, FORMATS, PICTURES_UP_TO, Report, list_items, reconstruct_dataset
 from ..diagnose import Finding, diagnose
-from ..model.response_field import TaughtRange
-from ..pipeline.confidence import BEYOND
 from ..stream import NOT_METRIC, read_background, read_press_images
 from .options import (
     add_background_frames,
@@ -82,7 +80,7 @@ def run(arguments: argparse.Namespace) -> int:
     if report.rank > 0:
         return 0
     unit = load_calibration(calibration)
-    print_report(report, arguments.out, None if arguments.network or unit.response is None else unit.response.taught)
+    print_report(report, arguments.out)
     if not unit.metric:
         print(f"{NOT_METRIC}: {'; '.join(unit.report['not_metric'])}")
     if arguments.pictures is None and report.rows > PICTURES_UP_TO:
@@ -125,8 +123,8 @@ def calibrate_first(arguments: argparse.Namespace, inputs: list[Path]) -> Path:
     return path
 
 
-def print_report(report: Report, out: Path, taught: TaughtRange | None) -> None:
-    """Print the deepest frames, how many are deeper than the presses, how many were left out, and where the results are."""
+def print_report(report: Report, out: Path) -> None:
+    """Print the deepest frames, how many were left out, and where the results are."""
     with (out / "frames.csv").open(encoding="utf-8", errors="replace", newline="") as stream:
         rows = list(csv.DictReader(stream))
     rows.sort(key=lambda row: -float(row["deepest_mm"]))
@@ -137,9 +135,6 @@ def print_report(report: Report, out: Path, taught: TaughtRange | None) -> None:
         print(f"... the deepest {SHOWN} of {len(rows)}; contact in {sum(float(row['contact_mm2']) > 0 for row in rows)}")
     for name, note in report.notes:
         print(f"{name}: {note}")
-    deeper = 0 if taught is None else sum(float(row["deepest_mm"]) > BEYOND * taught.depth_mm for row in rows)
-    if taught is not None and deeper > 0:
-        print(f"beyond the presses, which reach {taught.depth_mm:.1f} mm: {deeper} of {len(rows)} frames; there it extrapolates")
     if report.failed:
         print(f"{len(report.failed)} left out, all of them in {out / 'failed.csv'}")
     before = f", {report.before} of them by an earlier run" if report.before else ""

@@ -7,12 +7,12 @@ from collections.abc import Iterator, Sequence
 from torch import Tensor
 
 from ..calibration import CalibrationWarning, Press, calibrate
+from ..calibration.doubts import NOT_CHECKED
 from ..core.tables import markdown, number
 from ..diagnose.checks import SATURATED_SHARE
 from ..model import Calibration, PointLights, Sensor
-from ..model.coverage import press_next
 from ..model.report import PressRow, Report
-from ..pipeline.expected_error import expected_model_deg
+from ..model.stated_error import UNKNOWN_DEG, press_next
 from ..stream import NOT_METRIC
 
 SHOWN = 5
@@ -46,18 +46,17 @@ def print_calibration(calibration: Calibration, candidates: bool = False) -> Non
     reason = report.get("reason", BY[report["source"]])
     print(f"chosen: {reason}" if reason.startswith(f"{kind}:") else f"chosen: {kind}: {reason}")
     print(f"expected: {expected(calibration)}")
-    if calibration.response is not None and (taught := calibration.response.taught) is not None:
-        print(f"range: slopes up to {taught.angle_deg:.0f} degrees, depths up to {taught.depth_mm:.1f} mm; beyond, it extrapolates")
-    share, place = press_next(calibration)
-    if place is not None:
+    if (least_known := press_next(calibration)) is not None:
+        place, error_deg = least_known
         x, y = ((n - 0.5 * (size - 1)) * sensor.mm_per_pixel for n, size in zip(place, (sensor.width, sensor.height), strict=True))
         where = f"x {place[0]}, y {place[1]} px of rectified images ({x:+.1f}, {y:+.1f} mm from the middle)"
-        print(f"covered: presses lie on {share:.0%} of the skin; press next around {where}")
+        print(f"press next: around {where}: there normals are expected to about {error_deg:.1f} degrees")
     saturated = float((calibration.background >= calibration.saturation_light).any(0).double().mean())
     if saturated > SATURATED_SHARE:
         print(f"saturated: {saturated:.0%} of the background: depth is worse there; reduce the exposure and calibrate again")
-    if report["source"] == "presses" and "prior_deg" not in report:
-        print("scale: that of mm_per_pixel and of the diameters given; nothing else checks it, so measure both twice")
+    for doubt in report["doubts"]:
+        if doubt.startswith(NOT_CHECKED):
+            print(doubt)
     alone = [row["name"] for row in report.get("presses", []) if row["used"] and row.get("gain_std", 0.0) > ALONE]
     if alone:
         named = ", ".join(alone[:SHOWN]) + (f" and {len(alone) - SHOWN} more" if len(alone) > SHOWN else "")
@@ -94,18 +93,17 @@ def expected(calibration: Calibration) -> str:
         if spread is None:
             return "as good as the positions of the lights that were given; presses of a ball would measure it"
         return f"directions of the lights to {max(spread):.2f} degrees (standard deviation of the worst)"
-    degrees = f"normals within a contact to about {expected_model_deg(calibration):.1f} degrees"
+    by_type = report.get("prior_deg") if report["source"] == "prior" else None
+    degrees = f"normals within a contact to about {report.get('stated_deg', by_type or UNKNOWN_DEG):.1f} degrees"
+    if report["source"] == "prior":
+        how = "the mean over units that its prior was tried on" if by_type else "a guess: its prior was never tried"
+        return f"{degrees}, {how}; presses of a ball would measure it on this one"
+    if "stated_deg" not in report:
+        return f"{degrees}, a guess; presses of a ball would measure it"
     if report.get("held_out_deg"):
         used = sum(row["used"] for row in report.get("presses", []))
-        scored = f"{report['held_out_deg']:.1f} on each of {used} presses by the others"
-        return f"{degrees}: {scored}, and more where no ball was pressed"
-    if report["source"] == "prior":
-        how = "the mean over units that its prior was tried on" if report.get("prior_deg") else "a guess: its prior was never tried"
-        return f"{degrees}, {how}; presses of a ball would measure it on this one"
-    if "stated_deg" in report:
-        degrees = f"normals within a contact to about {report['stated_deg']:.1f} degrees"
-        return f"{degrees}, by what so few presses leave open; more presses of a ball would measure it"
-    return f"{degrees}, a guess; more presses of a ball would measure it"
+        return f"{degrees} anywhere on the skin: {report['held_out_deg']:.1f} on each of {used} presses by the others"
+    return f"{degrees}, by what so few presses leave open; more presses of a ball would measure it"
 
 
 def left_out(what: str, rows: list[tuple[str, str]]) -> Iterator[str]:

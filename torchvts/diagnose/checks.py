@@ -9,7 +9,8 @@ import torch
 
 from ..calibration import ROUGH, channel_structure
 from ..core.frame import Conditions
-from ..pipeline import UNEVEN, UNSEEN_DEG, DepthPipeline, beyond_presses, light_levels, light_unevenness
+from ..model.stated_error import NOT_METRIC_DEG, stated_deg, stated_error_deg
+from ..pipeline import UNEVEN, UNSEEN_DEG, DepthPipeline, light_levels, light_unevenness
 from ..stream import FrameCheck
 from .camera import blockiness, levels_of, new_spots, pattern_likeness, texture_share
 from .examination import MISFITS, Examination
@@ -27,8 +28,8 @@ scatters light over all of a small sensor."""
 OTHER_DEG = 1.2
 """The same from which it is asked whether the frame is from another unit of its type: 1.4 to 5 degrees on three of one type."""
 
-FAR_BEYOND = 4.0
-"""Depth of a contact over that of the presses, above which a frame is spoilt rather than the object deep: good frames reach 3."""
+BEYOND = 2.0
+"""Error that the calibration states for a contact, over that for its own presses, from which it is said."""
 
 BLOCKY = 1.18
 """Ratio of steps at the borders of 8 x 8 blocks to those inside above which an image was compressed; noise alone stays below 1.1,
@@ -298,12 +299,13 @@ def _steepest(e: Examination) -> float:
 
 
 def _beyond_presses(e: Examination) -> Figures | None:
-    text = beyond_presses(e.unit, e.output)[0]
-    if not text:
+    """Mean error that the calibration states for the contact, over that for its own presses."""
+    own_deg = e.unit.report.get("own_deg")
+    if e.unit.covariance is None or own_deg is None or not bool(e.output.contact.any()):
         return None
-    inside, taught = e.output.contact, e.unit.response.taught if e.unit.response is not None else None
-    times = 1.0 if taught is None else float(e.output.depth_mm[inside].quantile(0.95)) / taught.depth_mm
-    return {"value": math.degrees(math.atan(float(e.steepness[inside[0, 0]].max()))), "text": text, "times": times}
+    expected = float(stated_error_deg(e.unit, e.frame.image)[e.output.contact].mean())
+    own = float(stated_deg(own_deg, torch.zeros(())))
+    return {"value": expected / own, "expected": expected, "own": own}
 
 
 def _shadow(e: Examination) -> float:
@@ -394,9 +396,10 @@ CHECKS = (
           "note"),
     Check("steep_walls", _steepest, "walls of {value:.0f} degrees: a light may be blocked there, and integration cannot keep a "
           "step; use precise mode, trust the top only", "note", above=52.0),
-    Check("beyond_presses", _beyond_presses, "{text}: normals and depth are extrapolated there, unless the frame is spoilt; "
-          "calibrate again with presses of a smaller ball, deeper, or in that place",
-          lambda figures: "warning" if figures["times"] > FAR_BEYOND else "note"),
+    Check("beyond_presses", _beyond_presses, "normals of this contact are expected to be off by {expected:.0f} degrees, "
+          "{value:.1f} times as much as on the presses: it is steeper, deeper or elsewhere, unless the frame is spoilt; calibrate "
+          "again with presses of a smaller ball, deeper, or in that place",
+          lambda figures: "warning" if figures["expected"] > NOT_METRIC_DEG else "note", above=BEYOND),
     Check("shadow", _shadow, "a light is blocked in {value:.0%} of the contact: slopes there are estimated from two lights; press "
           "less, or raise the LEDs", lambda figures: "warning" if figures["value"] > 0.3 else "note", above=0.01),
     Check("cast_shadow", _cast_shadow, "a shadow falls on {value:.1%} of the image, on flat skin: modes fast and those of response "

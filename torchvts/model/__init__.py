@@ -2,13 +2,12 @@
 
 from . import gs_sdk
 from .calibration import Calibration, check_calibration
-from .coverage import distance_to_presses, press_next
 from .lights import PointLights, near_field_shading
 from .markers import FillMarkers, fill_markers, find_markers
 from .report import Report
 from .response_field import DepthBrightness, ResponseField, ResponseModel, SensorPrior
 from .sensor import Sensor, check_sensor, shipped_sensors
-from .stated_error import stated_deg, stated_error_deg
+from .stated_error import StatedError, press_next, stated_deg, stated_error_deg
 
 __all__ = [
     "Calibration",
@@ -20,9 +19,9 @@ __all__ = [
     "ResponseModel",
     "Sensor",
     "SensorPrior",
+    "StatedError",
     "check_calibration",
     "check_sensor",
-    "distance_to_presses",
     "fill_markers",
     "find_markers",
     "gs_sdk",

@@ -195,50 +195,6 @@ class DepthBrightness:
 
 
 @dataclass(frozen=True)
-class TaughtRange:
-    """How steep and how deep the presses were that a response was fitted to, and how fast it errs beyond.
-
-    Args:
-        sine: 95 % of the pixels of the presses are no steeper, ``slope / sqrt(1 + |slope|^2)``.
-        depth_mm: 95 % of the pixels of the presses lie no deeper, mm.
-        growth: error of the sine per sine beyond the range, by fields of the same size that are fitted to the flatter part of the
-            same presses and scored on their rims.
-    Raises:
-        ValueError, TypeError: names the argument.
-    Example:
-        >>> round(TaughtRange(0.5, 0.4, 0.3).angle_deg)
-        30
-    """
-
-    sine: float
-    depth_mm: float
-    growth: float
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "sine", check_positive("sine", self.sine, 1.0))
-        for name in ("depth_mm", "growth"):
-            object.__setattr__(self, name, check_least(name, getattr(self, name)))
-
-    @property
-    def angle_deg(self) -> float:
-        """The steepest angle of the presses, degrees."""
-        return math.degrees(math.asin(min(1.0, self.sine)))
-
-    def with_all_of(self, other: "TaughtRange") -> "TaughtRange":
-        """The range of both: the steeper and deeper one, and the error beyond of this one."""
-        return TaughtRange(max(self.sine, other.sine), max(self.depth_mm, other.depth_mm), self.growth)
-
-    def to_dict(self) -> dict[str, float]:
-        """Plain numbers, to three digits."""
-        return {name: float(f"{value:.3g}") for name, value in dataclasses.asdict(self).items()}
-
-    @classmethod
-    def from_dict(cls, values: Any, source: str) -> "TaughtRange":
-        """Read the output of :meth:`to_dict`; ``source`` names it in errors."""
-        return from_dict(cls, values, source)
-
-
-@dataclass(frozen=True)
 class ResponseModel:
     """Response of a sensor: a field, what depth alone does to brightness, and the preprocessing of images.
 
@@ -247,7 +203,6 @@ class ResponseModel:
         by_depth: applied to the change of brightness in a second pass, with the depth of the first; None if not known.
         gamma: of the images it was fitted to, value = light^(1/gamma).
         blur_px: standard deviation of the Gaussian blur it was fitted with, pixels of the calibrated size.
-        taught: how steep and how deep its presses were; None if not known, as in files of older versions.
     Raises:
         ValueError, TypeError: names the argument.
     """
@@ -256,15 +211,12 @@ class ResponseModel:
     by_depth: DepthBrightness | None
     gamma: float = 1.0
     blur_px: float = 1.0
-    taught: TaughtRange | None = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.field, ResponseField):
             raise TypeError(f"field: expected a ResponseField, got {brief(self.field)}")
         if self.by_depth is not None and not isinstance(self.by_depth, DepthBrightness):
             raise TypeError(f"by_depth: expected a DepthBrightness or None, got {brief(self.by_depth)}")
-        if self.taught is not None and not isinstance(self.taught, TaughtRange):
-            raise TypeError(f"taught: expected a TaughtRange or None, got {brief(self.taught)}")
         object.__setattr__(self, "gamma", check_positive("gamma", self.gamma, 10.0))
         if self.blur_px != 0:
             check_positive("blur_px", self.blur_px)
@@ -278,8 +230,7 @@ class ResponseModel:
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers."""
         by_depth = None if self.by_depth is None else self.by_depth.to_dict()
-        numbers = {"gamma": self.gamma, "blur_px": self.blur_px, "field": self.field.to_dict(), "by_depth": by_depth}
-        return numbers if self.taught is None else numbers | {"taught": self.taught.to_dict()}
+        return {"gamma": self.gamma, "blur_px": self.blur_px, "field": self.field.to_dict(), "by_depth": by_depth}
 
     @classmethod
     def from_dict(cls, values: Any, source: str) -> "ResponseModel":
@@ -291,8 +242,7 @@ class ResponseModel:
             values["field"] = ResponseField.from_dict(values["field"], f"{source}: field")
         if values.get("by_depth") is not None:
             values["by_depth"] = DepthBrightness.from_dict(values["by_depth"], f"{source}: by_depth")
-        if values.get("taught") is not None:
-            values["taught"] = TaughtRange.from_dict(values["taught"], f"{source}: taught")
+        values.pop("taught", None)  # older files say how steep and deep their presses were
         return from_dict(cls, values, source)
 
 

@@ -2,7 +2,7 @@
 
 from ..core.frame import Conditions, DepthOutput
 from .conditions import UNEVEN, UNSEEN_DEG, doubts_of, light_levels, light_unevenness, usual_unseen_deg
-from .confidence import Bounds, Confidence, ConfidentOutput, ConfidentPipeline, beyond_presses, bound_at
+from .confidence import Confidence, ConfidentOutput, ConfidentPipeline, bound_at
 from .depth import MODES, DepthPipeline
 from .frozen import FrozenPipeline
 from .refine import Adaptive, Once, Repeat, SlopesOfDepth, SlopesOfPixels
@@ -15,7 +15,6 @@ __all__ = [
     "UNEVEN",
     "UNSEEN_DEG",
     "Adaptive",
-    "Bounds",
     "Conditions",
     "Confidence",
     "ConfidentOutput",
@@ -29,7 +28,6 @@ __all__ = [
     "SlopesOfDepth",
     "SlopesOfPixels",
     "Solve",
-    "beyond_presses",
     "bound_at",
     "doubts_of",
     "light_levels",

@@ -331,7 +331,8 @@ def calibration_figure(calibration: Calibration, presses: Sequence[Press]) -> Fi
     lines, side = -(-len(shown) // 2), 2.35 * min(1.4, height / width)
     figure = new_figure(10.4, (lines + 1) * (side + 0.35) + 0.3 + 0.17 * (text.count("\n") + 1))
     ratios = ((lines + 1) * (side + 0.35), 0.3 + 0.17 * (text.count("\n") + 1))
-    top, bottom = np.ravel(figure.subfigures(2, 1, height_ratios=ratios))
+    parts: Any = figure.subfigures(2, 1, height_ratios=ratios)
+    top, bottom = parts
     bottom.text(0.01, 0.98, text, fontsize=8, va="top")
     axes = top.subplots(lines + 1, 4, squeeze=False)
     for panel in axes.flat:

@@ -92,3 +92,14 @@ def test_presses_of_a_digit_are_used(data):
     contacts = read_contacts(presses, vts.read_image(folder / "background.png"), with_preprocessing(sensor, None))
     assert [contact.reason for contact in contacts] == [""] * len(presses)
     assert all(0.05 < float(contact.mask.double().mean()) < 0.4 for contact in contacts)
+
+
+def test_a_label_far_from_the_contact_is_left_out():
+    presses = take_presses(count=6)
+    middle = torch.tensor([(WIDTH - 1) / 2, (HEIGHT - 1) / 2])
+    labels = [(middle + torch.tensor(at) / PITCH).tolist() for at in CENTERS_MM[:6]]
+    wrong = (labels[0][0] - 45.0, labels[0][1])
+    given = [dataclasses.replace(press, center_px=at) for press, at in zip(presses, [wrong, *labels[1:]])]
+    _, contacts = by_presses(background(), GIVEN, given, None)
+    assert re.fullmatch("label is 4[3-7] px from the contact", contacts[0].reason), contacts[0].reason
+    assert [contact.reason for contact in contacts[1:]] == [""] * 5

@@ -1,5 +1,8 @@
 """Locate the ball in each press: by its outline, by slopes that are known, or jointly with response fields of rising size."""
 
+import dataclasses
+import math
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -22,6 +25,15 @@ pale GelSight)."""
 WIDEST = 0.95
 """Largest contact radius that is searched, in radii of the ball: at 0.95 its slope is 3."""
 
+LABEL_PX = 1.5
+"""Standard deviation of a label, pixels: those of five real sensors are good to 1 to 2."""
+
+OUTLINE = 0.15
+"""The same of the center of an outline, in its radii: 5 px on a GelSight Mini and a pale GelSight."""
+
+FAR_LABEL = 4.0
+"""A label so many standard deviations from the outline's center is wrong."""
+
 JOINT_STAGES = ((0, -1, 3), (1, -1, 3), (2, -1, 6), (3, 2, 4))
 """Families and rounds in which balls are located jointly. Linear fields come first: with products the field can imitate a shift of
 all centers, so that stage only refines, each center regularised to the linear result by a third of a press."""
@@ -40,7 +52,9 @@ def locate(contacts: list[Contact], sensor: Sensor, prior: ResponseModel | None,
     for contact in contacts:
         if not contact.reason and 0.0 < contact.radius_mm < 2.0 * pitch_mm:
             contact.reason = f"a ball of {2 * contact.radius_mm:g} mm is smaller than four pixels: is its diameter in mm?"
-        if not contact.reason and not contact.known:
+        if not contact.reason and contact.known:
+            contact.reason = wrong_label(contact, sensor)
+        elif not contact.reason:
             guess_circle(contact, sensor)
     usable = used(contacts)
     if prior is not None:
@@ -55,6 +69,18 @@ def locate(contacts: list[Contact], sensor: Sensor, prior: ResponseModel | None,
     for contact in usable:
         if not contact.reason and int(contact.inside().sum()) < LEAST_INSIDE:
             contact.reason = "no ball of this diameter fits the contact"
+
+
+def wrong_label(contact: Contact, sensor: Sensor) -> str:
+    """That a label lies further from the outline of the contact than both can err, or that nothing is seen there; or ""."""
+    outline = dataclasses.replace(contact)
+    guess_circle(outline, sensor)
+    off_mm = float((contact.center_mm - outline.center_mm).norm())
+    if not outline.reason and off_mm > FAR_LABEL * math.hypot(LABEL_PX * sensor.mm_per_pixel, OUTLINE * outline.outline_mm):
+        return f"label is {off_mm / sensor.mm_per_pixel:.0f} px from the contact"
+    if int(contact.inside().sum()) < LEAST_INSIDE:
+        return "no contact is seen at the given center and contact radius: a mistake in the label?"
+    return ""
 
 
 def _locate_jointly(contacts: list[Contact], pitch_mm: float, half_mm: float) -> None:

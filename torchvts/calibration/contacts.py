@@ -185,8 +185,6 @@ def _place(contact: Contact, press: Press, sensor: Sensor) -> None:
     contact.radius_known = press.contact_radius_px is not None
     radius_px = press.contact_radius_px or math.sqrt(float(contact.mask.sum()) / math.pi) * 0.6
     contact.contact_radius_mm = min(radius_px * sensor.mm_per_pixel, 0.9 * contact.radius_mm)
-    if not contact.reason and int(contact.inside().sum()) < LEAST_INSIDE:
-        contact.reason = "no contact is seen at the given center and contact radius: a mistake in the label?"
 
 
 def _unusable(image: Tensor, background: Tensor, differs: Tensor, spread: float) -> str:

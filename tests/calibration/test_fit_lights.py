@@ -362,3 +362,10 @@ def test_the_derivatives_of_a_background_are_those_of_its_model(tiny, gloss):
     found, expected = pixels.linearised(parameter), residual_and_jacobian(pixels.residual, parameter)
     assert torch.equal(found[0], expected[0])
     assert (found[1] - expected[1]).abs().max() <= 1e-12 * expected[1].abs().max()
+
+
+def test_a_channel_that_is_black_in_half_of_the_background_is_named(small_background, small_sensor):
+    dark = small_background.clone()
+    dark[2, :, : dark.shape[2] * 6 // 10] = 0.0
+    with pytest.raises(ValueError, match="expected light in channel B, got one that is black in 60% of the image"):
+        vts.calibrate(dark, small_sensor)

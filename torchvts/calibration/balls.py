@@ -120,7 +120,7 @@ def guess_circle(contact: Contact, sensor: Sensor) -> None:
 
     length = contact.change.square().sum(0).sqrt()[None, None]
     length = torch.nn.functional.avg_pool2d(length, 7, 1, 3, count_include_pad=False)[0, 0]
-    peak = 0.9 * length.max()
+    peak = 0.9 * (length * contact.mask).max()  # a spot beside the contact may have changed more
     ball_px = contact.radius_mm / sensor.mm_per_pixel
     wide = strong_blobs((length > 0.2 * peak) & contact.mask, torch.ones_like(length))
     if not wide:

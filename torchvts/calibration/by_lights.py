@@ -5,6 +5,7 @@ import dataclasses
 import torch
 from torch import Tensor
 
+from ..compensate.light import BLACK
 from ..model.calibration import Calibration
 from ..model.lights import PointLights, flat_image
 from ..model.report import Report
@@ -38,10 +39,16 @@ def by_lights(background: Tensor, sensor: Sensor, progress: bool = False) -> tup
     Returns:
         The unit, and why its depth is not in mm, as far as that is known.
     Raises:
-        ValueError: as :func:`fit_lights`; the fit failed, or no lights of different colours are seen.
+        ValueError: as :func:`fit_lights`; the fit failed, no lights of different colours are seen, or a channel is mostly black.
     """
     if sensor.light_position_mm is not None:
         return _given(background, sensor, sensor.light_position_mm)
+    for name, share in zip("RGB", (background <= BLACK).flatten(1).double().mean(dim=1).tolist()):
+        if share >= 0.5:
+            raise ValueError(
+                f"background: expected light in channel {name}, got one that is black in {share:.0%} of the image: an LED too "
+                "weak, or a camera that cuts off dark values: light it, or give presses of a ball"
+            )
     fit, linear = _fit(background, sensor, progress)
     if fit.failed:
         raise ValueError(

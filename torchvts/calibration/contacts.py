@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from ..compensate import Compensate
+from ..compensate.light import BLACK
 from ..core.blur import band_of_ratios, without_margin
 from ..core.geometry import gradient_from_normal, pixel_grid_mm
 from ..core.morphology import dilate, erode
@@ -143,8 +144,10 @@ def read_contacts(given: Sequence[Press], background: Tensor, sensor: Sensor) ->
     for item in given:
         ratio = compensate(item.image.detach().cpu().float()[None])
         change = ratio[0] - 1.0
-        differs = differing(change, noise)
-        above, spread = above_skin(change)
+        black = ((item.image <= BLACK) | (background <= BLACK)).cpu()  # a camera may cut off more of one image than of the other
+        seen = change.masked_fill(black, 0.0)
+        differs = differing(seen, noise)
+        above, spread = above_skin(seen)
         region = contact_region(above, differs, 0.5 * item.ball_diameter_mm / sensor.mm_per_pixel)
         saturated = ((item.image > SATURATED) & (background < SATURATED)).any(dim=0).cpu()
         contact = _sampled(item, change.double(), region, saturated, sensor)

@@ -32,6 +32,9 @@ PRESS_GAIN = 0.1
 WIDTH_ERROR = 0.05
 """Standard deviation of the width of a contact, in radii of the ball, that all presses of a set share: where its rim is seen."""
 
+WRONG_BALL = 0.5
+"""Part by which the diameter of one ball is wrong that the others should show: a radius for a diameter."""
+
 MANY, DISAGREEING = 6, 1.8
 """From so many presses, and so many standard deviations of their gains about the median (RMS), presses disagree with each other:
 sets of right presses of ten real and eight drawn sensors have at most 1.64, with two balls exchanged or doubled 1.6 to 4.3."""
@@ -152,18 +155,20 @@ def _directions(field: ResponseField, good: Sequence[Contact]) -> list[Doubt]:
 
 
 def width_of(field: ResponseField, good: Sequence[Contact], pitch_mm: float) -> tuple[float, float]:
-    """Width of contacts in radii of their balls, median, and its standard deviation; (0, 0) where all were given."""
+    """Width of contacts in radii of their balls, median, and its standard deviation; (0, 0) where few show the rim of theirs."""
     family, weight = Family.of(field), field.tensor()
-    widths = [_free_width(c, weight @ family.terms(c), pitch_mm) for c in good if not (c.known and c.radius_known)]
-    if not widths:
+    located = [c for c in good if not (c.known and c.radius_known)]
+    found = [_free_width(c, weight @ family.terms(c), pitch_mm) for c in located]
+    widths = [width for width in found if width is not None]
+    if not widths or 2 * len(widths) < len(located):
         return 0.0, 0.0
     median = statistics.median(widths)
     spread = statistics.median(abs(width - median) for width in widths) / 0.6745
     return median, math.hypot(WIDTH_ERROR, spread / math.sqrt(len(widths)))
 
 
-def _free_width(contact: Contact, sine: Tensor, pitch_mm: float) -> float:
-    """Radius at which the sine (2, N) has ceased to rise as that of a ball does, in radii of the given ball.
+def _free_width(contact: Contact, sine: Tensor, pitch_mm: float) -> float | None:
+    """Radius at which the sine (2, N) has ceased to rise as that of a ball does, in radii of the given ball; None where it has not.
 
     A sine rises evenly as long as the skin lies on a ball of whatever size, so this knows nothing of the given diameter.
     """
@@ -178,7 +183,7 @@ def _free_width(contact: Contact, sine: Tensor, pitch_mm: float) -> float:
     below = total[0] < RIM_SINE * rise * total[1]
     start = max(2, int(0.5 * contact.contact_radius_mm / pitch_mm))
     ends = below[start:].nonzero()
-    return (start + (int(ends[0]) if len(ends) else count - start)) * pitch_mm / contact.radius_mm
+    return (start + int(ends[0])) * pitch_mm / contact.radius_mm if len(ends) and rise > 0.0 else None
 
 
 def impossible_width(field: ResponseField, contacts: Sequence[Contact], pitch_mm: float) -> str:
@@ -210,9 +215,12 @@ def not_checked(contacts: Sequence[Contact], field: ResponseField, sensor: Senso
         )
     wide = width_of(field, used(contacts), sensor.mm_per_pixel)[0]
     limit = f", and no contact is wider than its ball with an mm_per_pixel up to {sensor.mm_per_pixel / wide:.3g}" if wide else ""
+    alone = [contact.name for contact in used(contacts) if SURE * contact.metrics.get("gain_std", math.inf) > WRONG_BALL]
+    named = ", ".join(alone[:3]) + (f" and {len(alone) - 3} more" if len(alone) > 3 else "")
     return Doubt(
         f"{NOT_CHECKED}: without a prior the images say nothing of the size of all balls, or of mm_per_pixel: scale rests on what "
         f"was given{limit}; an object of known height would check it"
+        + (f"; a diameter wrong by half would not show in {named}: press beside it, or measure these balls again" if alone else "")
     )
 
 

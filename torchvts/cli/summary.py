@@ -18,9 +18,6 @@ from ..stream import NOT_METRIC
 SHOWN = 5
 """Of a list, so many lines are printed."""
 
-ALONE = 0.2
-"""Standard deviation of the gain of a press by the others, from which they do not show a diameter that is wrong by half."""
-
 BY = {
     "given": "given",
     "sensor_file": "positions from the sensor file",
@@ -57,10 +54,6 @@ def print_calibration(calibration: Calibration, candidates: bool = False) -> Non
     for doubt in report["doubts"]:
         if doubt.startswith(NOT_CHECKED):
             print(doubt)
-    alone = [row["name"] for row in report.get("presses", []) if row["used"] and row.get("gain_std", 0.0) > ALONE]
-    if alone:
-        named = ", ".join(alone[:SHOWN]) + (f" and {len(alone) - SHOWN} more" if len(alone) > SHOWN else "")
-        print(f"not checked: diameters of {named}: no other press is near: press between them, or measure these balls again")
     for line in left_out("press", [(row["name"], row.get("reason", "")) for row in report.get("presses", []) if not row["used"]]):
         print(line)
     if candidates:

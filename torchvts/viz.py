@@ -43,6 +43,9 @@ _MAP = LinearSegmentedColormap.from_list(
 SOURCE, TARGET = "#d55e00", "#0072b2"
 """Colours of the two clouds of a pose; blue and vermilion, which all readers distinguish."""
 
+NAME_SHOWN = 22
+"""Characters of a name in a title."""
+
 PRESSES_SHOWN = 6
 """Presses in the picture of a calibration."""
 
@@ -329,8 +332,8 @@ def calibration_figure(calibration: Calibration, presses: Sequence[Press]) -> Fi
     text = "\n".join("\n".join(textwrap.wrap(doubt, 150, subsequent_indent="    ")) for doubt in doubts)
     height, width = calibration.background.shape[1:]
     lines, side = -(-len(shown) // 2), 2.35 * min(1.4, height / width)
-    figure = new_figure(10.4, (lines + 1) * (side + 0.35) + 0.3 + 0.17 * (text.count("\n") + 1))
-    ratios = ((lines + 1) * (side + 0.35), 0.3 + 0.17 * (text.count("\n") + 1))
+    figure = new_figure(10.4, (lines + 1) * (side + 0.35) + 0.7 + 0.17 * (text.count("\n") + 1))
+    ratios = ((lines + 1) * (side + 0.35) + 0.4, 0.3 + 0.17 * (text.count("\n") + 1))
     parts: Any = figure.subfigures(2, 1, height_ratios=ratios)
     top, bottom = parts
     bottom.text(0.01, 0.98, text, fontsize=8, va="top")
@@ -338,7 +341,7 @@ def calibration_figure(calibration: Calibration, presses: Sequence[Press]) -> Fi
     for panel in axes.flat:
         panel.set_axis_off()
     axes[0, 0].imshow(_picture(calibration.background_value))
-    axes[0, 0].set_title("background, balls found", fontsize=9)
+    axes[0, 0].set_title("background" + ", balls found (dashed: left out)" * bool(rows), fontsize=8)
     for row in rows.values():
         _circle(axes[0, 0], row)
     if (error := error_over_skin(calibration)) is not None:
@@ -354,7 +357,8 @@ def calibration_figure(calibration: Calibration, presses: Sequence[Press]) -> Fi
         off, inner = _left_deg(calibration, press, row), _left_deg(calibration, press, row, INSIDE)
         image.imshow(_picture(press.image))
         _circle(image, row)
-        image.set_title(press.name if row["used"] else f"{press.name}, left out", fontsize=9)
+        name = press.name if len(press.name) <= NAME_SHOWN else f"...{press.name[-NAME_SHOWN:]}"
+        image.set_title(name if row["used"] else f"{name}, left out", fontsize=9)
         drawn = left.imshow(off, cmap="cividis", vmin=0.0, vmax=10.0)
         left.set_title(f"normals off the ball's: {np.nanmean(inner):.1f} degrees", fontsize=9)
         _circle(left, row)
@@ -364,8 +368,9 @@ def calibration_figure(calibration: Calibration, presses: Sequence[Press]) -> Fi
 
 def _facts(calibration: Calibration) -> str:
     report = calibration.report
-    errors = [(key, report.get(f"{key}_deg")) for key in ("own", "held_out", "stated")]
-    figures = [f"{key.replace('_', ' ')}: {value:.2f} degrees" for key, value in errors if isinstance(value, float)]
+    words = {"own_deg": "on its own presses", "held_out_deg": "on each press by the others", "stated_deg": "expected anywhere"}
+    errors = [(text, report.get(key)) for key, text in words.items()]
+    figures = [f"{text}: {value:.2f} degrees" for text, value in errors if isinstance(value, float)]
     return "\n".join(
         [*textwrap.wrap(str(report.get("reason", "")), 46), *figures, "metric" if calibration.metric else "NOT METRIC"]
     )

@@ -101,7 +101,7 @@ def test_a_label_far_from_the_contact_is_left_out():
     wrong = (labels[0][0] - 45.0, labels[0][1])
     given = [dataclasses.replace(press, center_px=at) for press, at in zip(presses, [wrong, *labels[1:]])]
     _, contacts = by_presses(background(), GIVEN, given, None)
-    assert re.fullmatch("label is 4[3-7] px from the contact", contacts[0].reason), contacts[0].reason
+    assert re.fullmatch("label is 4[3-7] px from the contact: correct it, or leave it out", contacts[0].reason), contacts[0].reason
     assert [contact.reason for contact in contacts[1:]] == [""] * 5
 
 

@@ -77,7 +77,7 @@ def wrong_label(contact: Contact, sensor: Sensor) -> str:
     guess_circle(outline, sensor)
     off_mm = float((contact.center_mm - outline.center_mm).norm())
     if not outline.reason and off_mm > FAR_LABEL * math.hypot(LABEL_PX * sensor.mm_per_pixel, OUTLINE * outline.outline_mm):
-        return f"label is {off_mm / sensor.mm_per_pixel:.0f} px from the contact"
+        return f"label is {off_mm / sensor.mm_per_pixel:.0f} px from the contact: correct it, or leave it out"
     if int(contact.inside().sum()) < LEAST_INSIDE:
         return "no contact is seen at the given center and contact radius: a mistake in the label?"
     return ""

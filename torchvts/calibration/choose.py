@@ -102,7 +102,13 @@ def _from_presses(given: Given) -> Made:
     Raises:
         ValueError: no press can be used, or contacts are wider than their balls.
     """
-    made, contacts = _fitted(given)
+    contact = resting.beside_presses(given.background, given.presses)
+    try:
+        made, contacts = _fitted(given)
+    except NoUsablePress as error:
+        if not contact:
+            raise
+        raise ValueError(f"{contact}; {error}") from error
     unit = made.unit
     assert unit.response is not None
     field, pitch_mm = unit.response.field, given.sensor.mm_per_pixel
@@ -110,7 +116,7 @@ def _from_presses(given: Given) -> Made:
     if impossible and not given.force:
         raise ValueError(f"{impossible}; force=True (--force) goes on all the same")
     doubts = [*made.doubts, *of_presses(contacts, field, pitch_mm)]
-    if contact := resting.beside_presses(given.background, given.presses):
+    if contact:
         doubts.insert(0, Doubt(contact, True))
     if not any(doubt.of_scale for doubt in doubts):
         doubts.append(not_checked(contacts, field, given.sensor if "prior_deg" in unit.report else given.sensor.without_prior()))
@@ -138,7 +144,8 @@ def _fitted(given: Given) -> tuple[Made, list[Contact]]:
     left, count = len(used(contacts)), len(contacts)
     contradiction = "the background does not have its pattern of light" if strange else ""
     if not contradiction and left < LEAST_USED * count:
-        contradiction = f"by the prior only {left} of {count} presses can be used"
+        reasons = "; ".join(f"{contact.name}: {contact.reason}" for contact in contacts if contact.reason)
+        contradiction = f"by the prior only {left} of {count} presses can be used ({reasons})"
     if first is not None and not contradiction:
         return first, contacts
     try:

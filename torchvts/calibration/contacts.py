@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ..compensate import Compensate
-from ..compensate.light import BLACK
+from ..compensate.light import BLACK, unevenness
 from ..core.blur import band_of_ratios, without_margin
 from ..core.geometry import gradient_from_normal, pixel_grid_mm
 from ..core.morphology import dilate, erode
@@ -67,6 +67,7 @@ class Contact:
         center_mm: (2,), center of the ball, as far as known.
         contact_radius_mm: radius of the contact, as far as known.
         outline_mm: radius of the outline of the strong change; 0 where it was not searched.
+        uneven: unevenness of the image's light beside the background's.
         known: the center was given and is not searched.
         radius_known: the contact radius was given and is not searched.
         reason: why the contact is left out; empty if it is used.
@@ -85,6 +86,7 @@ class Contact:
     center_mm: Tensor = field(default_factory=lambda: torch.zeros(2, dtype=torch.float64))
     contact_radius_mm: float = 0.0
     outline_mm: float = 0.0
+    uneven: float = 0.0
     known: bool = False
     radius_known: bool = False
     reason: str = ""
@@ -151,6 +153,7 @@ def read_contacts(given: Sequence[Press], background: Tensor, sensor: Sensor) ->
         region = contact_region(above, differs, 0.5 * item.ball_diameter_mm / sensor.mm_per_pixel)
         saturated = ((item.image > SATURATED) & (background < SATURATED)).any(dim=0).cpu()
         contact = _sampled(item, change.double(), region, saturated, sensor)
+        contact.uneven = float(unevenness(compensate.light_of(item.image.detach().cpu().float()[None])).max())
         contact.reason = _unusable(item.image, background, differs, spread) or _saturated(float(saturated[region].double().mean()))
         if item.center_px is not None:
             _place(contact, item, sensor)

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from ..compensate.light import UNEVEN
 from ..core.arrays import array_of
 from ..core.views import Views
 from ..model.calibration import SATURATED, Calibration
@@ -84,10 +85,19 @@ def of_presses(contacts: Sequence[Contact], field: ResponseField, pitch_mm: floa
         pitch_mm: pixel pitch, mm.
     """
     good = used(contacts)
-    found = [Doubt(f"{contact.name}: left out: {contact.reason}") for contact in contacts if contact.reason]
+    uneven = statistics.median(contact.uneven for contact in contacts)
+    other = [Doubt(_other_light(uneven), True)] if uneven > UNEVEN else []
+    found = other + [Doubt(f"{contact.name}: left out: {contact.reason}") for contact in contacts if contact.reason]
     found += _sizes_by_each_other(good) + _directions(field, good)
     wide, std = width_of(field, good, pitch_mm)
     return [*found, Doubt(_too_wide(wide, std, pitch_mm), True)] if wide > 1.0 - std else found
+
+
+def _other_light(uneven: float) -> str:
+    return (
+        f"presses: their light differs from the background's by {uneven:.0%} unevenly, in the median (usual: up to {UNEVEN:.0%}): "
+        "another gamma, saturation or white balance of the camera: take background, presses and frames with the same settings"
+    )
 
 
 def of_sizes(contacts: Sequence[Contact], pitch_mm: float) -> list[Doubt]:
@@ -244,7 +254,13 @@ def of_type(background: Tensor, sensor: Sensor) -> list[Doubt]:
     seen = f"its pattern of light is not that of the unit on which the prior of sensor '{sensor.name}' was fitted"
     difference, view = views.difference(cells), views.other(cells)
     if view is not None and not (view.cropped and difference < SHIFTED):
-        return [Doubt(f"background: {seen}: it {view.in_words()}: turn, swap or crop the images as the sensor's are", True)]
+        return [
+            Doubt(
+                f"background: {seen}: it {view.in_words()}: turn, swap or crop the images as the sensor's are; where it "
+                "is cropped, mm_per_pixel may be wrong",
+                True,
+            )
+        ]
     if difference <= SAME_TYPE:
         return []
     return [
@@ -280,7 +296,8 @@ def of_fitted_lights(unit: Calibration) -> tuple[Calibration, list[Doubt]]:
         found.append(
             Doubt(
                 f"background: {standing_out:.1%} of the image differs from the fitted lights by more than 5 times their residual "
-                f"({', '.join(f'{v:.4f}' for v in spread.tolist())}): contact in the calibration image? take it again without",
+                f"({', '.join(f'{v:.4f}' for v in spread.tolist())}): contact in the calibration image? take it again without "
+                "contact",
                 True,
             )
         )

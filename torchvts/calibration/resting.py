@@ -82,7 +82,7 @@ def read_as_frame(unit: Calibration) -> str:
     row, column = divmod(int(depth.flatten().argmax()), depth.shape[-1])
     return (
         f"background: read as a frame it shows skin that is {deepest:.1f} mm deep around pixel ({column}, {row}): contact in the "
-        "calibration image? take it again without"
+        "calibration image? take it again without contact"
     )
 
 

@@ -9,7 +9,7 @@ import torch
 
 from ..calibration import ROUGH, channel_structure
 from ..core.frame import Conditions
-from ..model.stated_error import NOT_METRIC_DEG, stated_deg, stated_error_deg
+from ..model.stated_error import stated_deg, stated_error_deg
 from ..pipeline import UNEVEN, UNSEEN_DEG, DepthPipeline, light_levels, light_unevenness
 from ..stream import FrameCheck
 from .camera import blockiness, levels_of, new_spots, pattern_likeness, texture_share
@@ -305,7 +305,8 @@ def _beyond_presses(e: Examination) -> Figures | None:
         return None
     expected = float(stated_error_deg(e.unit, e.frame.image)[e.output.contact].mean())
     own = float(stated_deg(own_deg, torch.zeros(())))
-    return {"value": expected / own, "expected": expected, "own": own}
+    upright = e.output.normal[:, 2:3][e.output.contact].float().clamp(-1.0, 1.0)
+    return {"value": expected / own, "expected": expected, "slope": float(torch.rad2deg(torch.acos(upright)).mean())}
 
 
 def _shadow(e: Examination) -> float:
@@ -399,7 +400,7 @@ CHECKS = (
     Check("beyond_presses", _beyond_presses, "normals of this contact are expected to be off by {expected:.0f} degrees, "
           "{value:.1f} times as much as on the presses: it is steeper, deeper or elsewhere, unless the frame is spoilt; calibrate "
           "again with presses of a smaller ball, deeper, or in that place",
-          lambda figures: "warning" if figures["expected"] > NOT_METRIC_DEG else "note", above=BEYOND),
+          lambda figures: "warning" if figures["expected"] > figures["slope"] else "note", above=BEYOND),
     Check("shadow", _shadow, "a light is blocked in {value:.0%} of the contact: slopes there are estimated from two lights; press "
           "less, or raise the LEDs", lambda figures: "warning" if figures["value"] > 0.3 else "note", above=0.01),
     Check("cast_shadow", _cast_shadow, "a shadow falls on {value:.1%} of the image, on flat skin: modes fast and those of response "

@@ -3,6 +3,7 @@
 import torch
 from torch import Tensor
 
+from ..compensate.light import UNEVEN, unevenness
 from ..core.frame import Conditions
 from ..model.calibration import Calibration, check_calibration
 from .confidence import UNSEEN_DEG
@@ -14,9 +15,6 @@ MOST = 3.0
 LOST = 0.5
 """Share of a channel that is black or saturated from which it is said."""
 
-UNEVEN = 0.05
-"""Unevenness of the light's change that presses make at most: 0.03 on seven real sensors."""
-
 
 def light_levels(conditions: Conditions) -> Tensor:
     """The light of each channel over the background's, (B, 3)."""
@@ -25,7 +23,7 @@ def light_levels(conditions: Conditions) -> Tensor:
 
 def light_unevenness(conditions: Conditions) -> Tensor:
     """Root mean square over the image of what the light of each channel is off its level, over that level, (B, 3)."""
-    return conditions.light[:, :, 1:].square().sum(dim=2).sqrt() / conditions.light[:, :, 0].clamp_min(1e-6)
+    return unevenness(conditions.light)
 
 
 def usual_unseen_deg(calibration: Calibration, pipe: DepthPipeline) -> float:

@@ -77,7 +77,7 @@ TENSORS = {
     "integers": (put("background", lambda t: t.to(torch.int32)), "tensor 'background': expected .* floats, got .* torch.int32"),
 }  # fmt: skip
 METADATA = {
-    "a later version": (lambda m: m.update(format_version=99), "expected format version 8, got 99: .*update torchvts"),
+    "a later version": (lambda m: m.update(format_version=99), "expected format version 9, got 99: .*update torchvts"),
     "another kind": (lambda m: m.update(kind="mesh"), "expected a calibration, got a file of kind 'mesh'"),
     "no sensor": (lambda m: m.pop("sensor"), "expected keys and values, got NoneType"),
     "another sensor": (lambda m: m["sensor"].update(height=48), r"expected \(3, 48, 32\) floats, got \(3, 24, 32\)"),

@@ -341,7 +341,7 @@ def calibration_figure(calibration: Calibration, presses: Sequence[Press]) -> Fi
     for panel in axes.flat:
         panel.set_axis_off()
     axes[0, 0].imshow(_picture(calibration.background_value))
-    axes[0, 0].set_title("background" + ", balls found (dashed: left out)" * bool(rows), fontsize=8)
+    axes[0, 0].set_title("balls found (dashed: left out)" if rows else "background", fontsize=9)
     for row in rows.values():
         _circle(axes[0, 0], row)
     if (error := error_over_skin(calibration)) is not None:

@@ -13,6 +13,7 @@ from torchvts.calibration.by_presses import by_presses
 from torchvts.calibration.contacts import used
 from torchvts.calibration.doubts import of_sizes, width_of
 from torchvts.calibration.resting import beside_presses
+from torchvts.stream.background import with_background
 
 UNIT = drawn_sensor(0)
 
@@ -65,3 +66,10 @@ def test_a_wrong_background_is_named_with_its_place():
     center, radius = torch.tensor(UNIT.balls[0].center_px), UNIT.balls[0].contact_radius_px
     assert float((place - center).norm()) < 1.3 * radius
     assert not unit.metric and said in unit.report["not_metric"]
+
+
+def test_a_new_background_keeps_what_is_known_of_the_field():
+    """A stream takes its own: the bounds of its frames rest on the covariance."""
+    unit, _ = by_presses(UNIT.background, UNIT.sensor, bare(UNIT.balls[:3]), None)
+    again = with_background(unit, UNIT.background)
+    assert torch.equal(again.covariance, unit.covariance)

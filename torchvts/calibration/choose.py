@@ -14,7 +14,7 @@ from . import resting
 from .by_lights import by_lights
 from .by_presses import by_presses
 from .contacts import Contact, NoUsablePress, used
-from .doubts import Doubt, impossible_width, not_checked, of_fitted_lights, of_presses, of_sizes, of_type
+from .doubts import SURE, Doubt, not_checked, of_fitted_lights, of_presses, of_sizes, of_type, too_wide, width_of
 from .field import Family
 from .given_images import colourless
 from .posterior import Evidence, prior_of
@@ -112,14 +112,15 @@ def _from_presses(given: Given) -> Made:
     unit = made.unit
     assert unit.response is not None
     field, pitch_mm = unit.response.field, given.sensor.mm_per_pixel
-    impossible = impossible_width(field, contacts, pitch_mm)
-    if impossible and not given.force:
-        raise ValueError(f"{impossible}; force=True (--force) goes on all the same")
-    doubts = [*made.doubts, *of_presses(contacts, field, pitch_mm)]
+    width = width_of(field, used(contacts), pitch_mm)
+    if width.times > 1.0 + SURE * width.std and not given.force:
+        raise ValueError(f"{too_wide(width, pitch_mm)}; force=True (--force) goes on all the same")
+    doubts = [*made.doubts, *of_presses(contacts, field, pitch_mm, width)]
     if contact:
         doubts.insert(0, Doubt(contact, True))
     if not any(doubt.of_scale for doubt in doubts):
-        doubts.append(not_checked(contacts, field, given.sensor if "prior_deg" in unit.report else given.sensor.without_prior()))
+        sensor = given.sensor if "prior_deg" in unit.report else given.sensor.without_prior()
+        doubts.append(not_checked(contacts, sensor, width))
     return made._replace(unit=with_contact(unit, given.presses, contacts), doubts=doubts)
 
 

@@ -52,14 +52,11 @@ SAME_TYPE = 0.27
 is 0.03 to 0.08 on three GelSight Minis and 0.06 and 0.26 on two DIGITs, at most 0.24 with the frame shifted by 8 %, and at least
 0.30 on 18 sensors of other types."""
 
-
 SHIFTED = 0.15
 """The same, from which a frame is cropped otherwise, not only shifted as units are: whole frames of a GelSight Mini have 0.17."""
 
-
 STANDING_OUT = 0.01
 """Share of a background that differs clearly from fitted lights, from which it may hold a contact."""
-
 
 NOT_CHECKED = "not checked"
 """How the doubt begins that says what no image could show: it is no warning."""
@@ -76,21 +73,28 @@ class Doubt(NamedTuple):
     of_scale: bool = False
 
 
-def of_presses(contacts: Sequence[Contact], field: ResponseField, pitch_mm: float) -> list[Doubt]:
+class Width(NamedTuple):
+    """Width of contacts in radii of their balls, and its standard deviation; (0, 0) where few show the rim of theirs."""
+
+    times: float
+    std: float
+
+
+def of_presses(contacts: Sequence[Contact], field: ResponseField, pitch_mm: float, width: Width) -> list[Doubt]:
     """Presses that were left out, sizes that the presses themselves contradict, and slopes that are not seen.
 
     Args:
         contacts: of all presses, located.
         field: fitted to those that are used.
         pitch_mm: pixel pitch, mm.
+        width: of those, see :func:`width_of`.
     """
     good = used(contacts)
     uneven = statistics.median(contact.uneven for contact in contacts)
     other = [Doubt(_other_light(uneven), True)] if uneven > UNEVEN else []
     found = other + [Doubt(f"{contact.name}: left out: {contact.reason}") for contact in contacts if contact.reason]
     found += _sizes_by_each_other(good) + _directions(field, good)
-    wide, std = width_of(field, good, pitch_mm)
-    return [*found, Doubt(_too_wide(wide, std, pitch_mm), True)] if wide > 1.0 - std else found
+    return [*found, Doubt(too_wide(width, pitch_mm), True)] if width.times > 1.0 - width.std else found
 
 
 def _other_light(uneven: float) -> str:
@@ -164,17 +168,17 @@ def _directions(field: ResponseField, good: Sequence[Contact]) -> list[Doubt]:
     ]
 
 
-def width_of(field: ResponseField, good: Sequence[Contact], pitch_mm: float) -> tuple[float, float]:
-    """Width of contacts in radii of their balls, median, and its standard deviation; (0, 0) where few show the rim of theirs."""
+def width_of(field: ResponseField, good: Sequence[Contact], pitch_mm: float) -> Width:
+    """The median width of contacts."""
     family, weight = Family.of(field), field.tensor()
     located = [c for c in good if not (c.known and c.radius_known)]
     found = [_free_width(c, weight @ family.terms(c), pitch_mm) for c in located]
     widths = [width for width in found if width is not None]
     if not widths or 2 * len(widths) < len(located):
-        return 0.0, 0.0
+        return Width(0.0, 0.0)
     median = statistics.median(widths)
     spread = statistics.median(abs(width - median) for width in widths) / 0.6745
-    return median, math.hypot(WIDTH_ERROR, spread / math.sqrt(len(widths)))
+    return Width(median, math.hypot(WIDTH_ERROR, spread / math.sqrt(len(widths))))
 
 
 def _free_width(contact: Contact, sine: Tensor, pitch_mm: float) -> float | None:
@@ -196,26 +200,22 @@ def _free_width(contact: Contact, sine: Tensor, pitch_mm: float) -> float | None
     return (start + int(ends[0])) * pitch_mm / contact.radius_mm if len(ends) and rise > 0.0 else None
 
 
-def impossible_width(field: ResponseField, contacts: Sequence[Contact], pitch_mm: float) -> str:
-    """That contacts are wider than their balls, by more than the error of that; "" where they need not be."""
-    wide, std = width_of(field, used(contacts), pitch_mm)
-    return _too_wide(wide, std, pitch_mm) if wide > 1.0 + SURE * std else ""
-
-
-def _too_wide(wide: float, std: float, pitch_mm: float) -> str:
+def too_wide(width: Width, pitch_mm: float) -> str:
+    """That contacts are as wide as their balls, or wider, as no contact is."""
     return (
-        f"presses: expected contacts narrower than their balls, got {wide:.2f} +- {std:.2f} times as wide: either mm_per_pixel, "
-        f"{pitch_mm:g}, is too large (at most {pitch_mm / wide:.3g} is possible), or radii were given for diameters"
+        f"presses: expected contacts narrower than their balls, got {width.times:.2f} +- {width.std:.2f} times as wide: either "
+        f"mm_per_pixel, {pitch_mm:g}, is too large (at most {pitch_mm / width.times:.3g} is possible), or radii were given for "
+        "diameters"
     )
 
 
-def not_checked(contacts: Sequence[Contact], field: ResponseField, sensor: Sensor) -> Doubt:
+def not_checked(contacts: Sequence[Contact], sensor: Sensor, width: Width) -> Doubt:
     """What the images cannot show of sizes and pitch.
 
     Args:
         contacts: of all presses.
-        field: fitted to those that are used.
         sensor: with the prior that they were fitted from, if any.
+        width: of the contacts, see :func:`width_of`.
     """
     if sensor.prior is not None:
         return Doubt(
@@ -223,8 +223,8 @@ def not_checked(contacts: Sequence[Contact], field: ResponseField, sensor: Senso
             f"{math.exp(SURE * _std_by_prior(len(used(contacts)))):.1f}: scale rests on what was given; an object of known height "
             "would check it"
         )
-    wide = width_of(field, used(contacts), sensor.mm_per_pixel)[0]
-    limit = f", and no contact is wider than its ball with an mm_per_pixel up to {sensor.mm_per_pixel / wide:.3g}" if wide else ""
+    most = f"{sensor.mm_per_pixel / width.times:.3g}" if width.times else ""
+    limit = f", and no contact is wider than its ball with an mm_per_pixel up to {most}" if most else ""
     alone = [contact.name for contact in used(contacts) if SURE * contact.metrics.get("gain_std", math.inf) > WRONG_BALL]
     named = ", ".join(alone[:3]) + (f" and {len(alone) - 3} more" if len(alone) > 3 else "")
     return Doubt(

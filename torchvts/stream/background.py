@@ -282,7 +282,7 @@ def with_background(calibration: Calibration, background: Tensor) -> Calibration
     check_image("background", background, sensor.height, sensor.width, sensor.name)
     if calibration.response is not None:
         background = background.to(calibration.background.dtype)
-        unit = Calibration.from_response(calibration.response, sensor, background, calibration.report)
+        unit = Calibration.from_response(calibration.response, sensor, background, calibration.report, calibration.covariance)
     else:
         assert calibration.lights is not None
         unit = Calibration.from_lights(calibration.lights, sensor, background, calibration.report, calibration.ambient)

@@ -64,10 +64,9 @@ TABLE = {
         {"depth_mm": batches(1), "weight": [*batches(1), *OTHER_DEPTHS]}, lambda: vts.skin.ZeroBackground(1.0)),
     "DepthPipeline": Entry({
         **{name: getattr(pipe(), name) for name in ("compensate", "mask", "normals", "gradient", "integrate")}, "mode": "fast",
-        "mm_per_pixel": pipe().mm_per_pixel, "tolerance_px": 0.002, "refine_threshold_px": 0.05, "max_passes": 8}, {
+        "mm_per_pixel": pipe().mm_per_pixel}, {
         **{name: [None, lambda x: x] for name in ("compensate", "mask", "normals", "gradient", "integrate")},
-        "contact": [lambda x: x, 0.8], "mode": ["slow", None, 1], "tolerance_px": NUMBER,
-        "refine_threshold_px": ["1", None, NAN, -1.0], "max_passes": INTEGER}),
+        "contact": [lambda x: x, 0.8], "mode": ["slow", None, 1, "auto"]}),
     "DepthPipeline.from_calibration": Entry({"calibration": unit(), "mode": "fast", "normals": None, "integrate": None},
         {"mode": ["slow", None, 1], "normals": ["lookup", 3], "integrate": ["dct", 3], "contact": ["4.5", 4.5, torch.ones(3)]}),
     "DepthPipeline.from_gs_sdk": Entry({"weights": ..., "background": image(), "sensor": sensor(), "mode": "fast"}, {
@@ -96,16 +95,14 @@ TABLE = {
     "NormalFromIntensity.from_calibration": Entry(
         {"calibration": unit(), "camera_height_mm": 30.0}, {"calibration": [*OTHERS, unit("response")], "camera_height_mm": HEIGHTS}
         ),
-    "NormalFromIntensity.forward": Entry({"image": FLAT[None], "depth_mm": DEPTH, "noise_std": NOISE},
-        {"image": batches(3), "depth_mm": [b for b in batches(1) if b is not None], "noise_std": BAD_NOISE},
+    "NormalFromIntensity.forward": Entry({"image": FLAT[None], "depth_mm": DEPTH},
+        {"image": batches(3), "depth_mm": [b for b in batches(1) if b is not None]},
         lambda: pipe().normals, named={"image": "compensated"}),
-    "NormalFromIntensity.noise_of": forward(lambda: pipe().normals.noise_of, 3, "compensated"),
     "NormalFromIntensity.solve": Entry(
-        {"image": FLAT[None], "depth_mm": None, "expected": torch.zeros(1, 2, HEIGHT, WIDTH), "noise_std": NOISE}, {
+        {"image": FLAT[None], "depth_mm": None, "expected": torch.zeros(1, 2, HEIGHT, WIDTH)}, {
         "image": batches(3), "depth_mm": [b for b in batches(1) if b is not None],
-        "expected": [b for b in batches(2) if b is not None], "noise_std": BAD_NOISE}, lambda: pipe().normals.solve,
+        "expected": [b for b in batches(2) if b is not None]}, lambda: pipe().normals.solve,
         named={"image": "compensated"}),
-    "NormalFromIntensity.coarse": Entry({"stride": 8}, {"stride": INTEGER}, lambda: pipe().normals.coarse),
     "NormalFromLookup": Entry(
         {"flat": FLAT, "table": torch.zeros(4, 4, 4, 2), "step": torch.ones(3), "zero_index": torch.ones(3, dtype=torch.int64)},
         {"flat": BAD_FLAT, "table": [torch.zeros(4, 4, 2), torch.full((4, 4, 4, 2), NAN), None, np.zeros((4, 4, 4, 2))],

@@ -106,7 +106,7 @@ TABLE = {
         {"calibration": [None, "unit"], "mode": ["slow"], "first": [], "stage": []}
         | {"network": [], "device": [None, "gpu", "cuda:99"], "contact": ["4.5", 4.5], "codec": []}),
     "stream.StreamReport": Entry({"stream": ...}, {"stream": [None, "camera"]}, run=False),
-    "stream.TactileStream": Entry({"source": ..., "sensor_or_calibration": sensor(), "mode": "auto", "background_frames": 12,
+    "stream.TactileStream": Entry({"source": ..., "sensor_or_calibration": sensor(), "mode": "fast", "background_frames": 12,
         "presses": (), "network": None, "device": "cpu", "reconnect_s": 0.0, "contact": None, "record": None}, {
         "reconnect_s": ["1", None, NAN, -1.0], "source": ["no/such.mp4", None, 2.5],
         "sensor_or_calibration": [None, "gelsight_mini"], "mode": ["slow", None], "background_frames": INTEGER, "presses": [],

@@ -97,7 +97,7 @@ def disagreements(size, counts=(1, 3)):
     """Frames of which frozen and plain pipelines do not agree, and how many comparisons were made."""
     scene, lights, units = units_of(size)
     wrong, done = [], 0
-    for unit, mode, count in ((unit, mode, count) for unit in units for mode in ("fast", "auto") for count in counts):
+    for unit, mode, count in ((unit, mode, count) for unit in units for mode in ("fast", "precise") for count in counts):
         pipe = vts.DepthPipeline.from_calibration(unit, mode)
         frozen = pipe.freeze()
         for fill, image in fills(scene, lights, count, size[1]).items():
@@ -146,7 +146,7 @@ def test_the_c_files_stay_within_their_memory(tmp_path):
         "    wrong, some = test_attack.disagreements(size, (1, 2))\n    done += some\n    assert not wrong, wrong[:3]\n"
         "for kind, make in test_frozen.UNITS.items():\n"
         "    calibration, images = make((240, 320), 0.08)\n"
-        "    frozen = vts.DepthPipeline.from_calibration(calibration, 'auto').freeze()\n    assert frozen.compiled\n"
+        "    frozen = vts.DepthPipeline.from_calibration(calibration, 'precise').freeze()\n    assert frozen.compiled\n"
         "    frozen(images)\n    done += len(images)\n"
         "from torchvts.scenes import objects\n"
         "track = [objects.press(objects.key(), objects.pose(2.0 * k), 121, 163, 0.12) for k in range(3)]\n"
@@ -172,7 +172,7 @@ def test_a_state_goes_into_a_pipeline_of_the_same_unit_only():
         sensor = vts.Sensor(**{"name": "rig", "height": 48, "width": 64, "mm_per_pixel": 0.6, **kind})
         scene = vts.scenes.sphere_press(8.0, 1.0, (0, 0), sensor.height, sensor.width, sensor.mm_per_pixel)
         background = vts.scenes.render(vts.scenes.undeformed(scene), lights, noise_std=0.004, seed=len(pipes))[0]
-        for mode in ("fast", "precise", "auto"):
+        for mode in ("fast", "precise"):
             for unit in (vts.Calibration.from_lights(lights, sensor), vts.Calibration.from_lights(lights, sensor, background)):
                 pipes.append((vts.DepthPipeline.from_calibration(unit, mode), vts.scenes.render(scene, lights)))
         response = ResponseModel(ResponseField(0, -1, 20.0, ((0.3, 0.1, -0.2), (-0.1, 0.3, -0.1))), None, sensor.exponent, 1.0)

@@ -113,10 +113,8 @@ CASES = {
     "ContactFromDepth": (lambda dtype: Beside(vts.ContactFromDepth(PITCH), torch.bool), depth, "depth_mm"),
     "DepthPipeline fast": (pipe("fast"), images, "images"),
     "DepthPipeline precise": (pipe("precise"), images, "images"),
-    "DepthPipeline auto": (pipe("auto"), images, "images"),
     "DepthPipeline response fast": (response_pipe("fast"), images, "images"),
     "DepthPipeline response precise": (response_pipe("precise"), images, "images"),
-    "DepthPipeline response auto": (response_pipe("auto"), images, "images"),
 }
 FREE = ("gradient", "normal", "depth_mm")
 SIZED = [name for name, (_, _, argument) in CASES.items() if argument not in FREE and name != "FillMarkers"]
@@ -297,7 +295,7 @@ def test_another_size_than_the_calibration_is_refused(name):
         block(example[..., :63])
 
 
-@pytest.mark.parametrize("mode", ["fast", "precise", "auto"])
+@pytest.mark.parametrize("mode", ["fast", "precise"])
 def test_another_size_is_refused_without_a_background(mode):
     lights = calibration(torch.float32).lights
     pipeline = vts.DepthPipeline.from_calibration(vts.Calibration.from_lights(lights, SENSOR), mode)

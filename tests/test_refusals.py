@@ -42,7 +42,7 @@ RECORDS = {
 """Results that users get and do not make: their constructors keep what they are given. (Their methods are in the table.)"""
 PARTS = {
     "PoseTracker", "PriorUnit", "TrackedPose",
-    "Adaptive", "DepthBrightness", "Integrator", "NormalModel", "Once", "Repeat", "ResponseField", "ResponseModel",
+    "DepthBrightness", "Integrator", "NormalModel", "Refine", "ResponseField", "ResponseModel",
     "SensorPrior", "Shadows", "SlopesOfDepth", "SlopesOfPixels", "Solve", "WrappedIntegrator", "WrappedNormals", "as_integrator",
     "as_normal_model", "by_presses", "channel_structure", "check_calibration", "check_domain", "check_sensor",
     "OutputFrame.", "discontinuity_share", "doubts_of", "label_contacts", "light_levels", "light_unevenness",

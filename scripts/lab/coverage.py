@@ -84,7 +84,7 @@ def of_presses(
         folder: presses in gs_sdk's layout, with labels.
         sensor: the sensor; its prior is used if it has one.
         learn: calibrate by the presses of the other folds; else by the background and the prior.
-        mode: "fast", "precise" or "auto".
+        mode: "fast" or "precise".
         progress: show a bar.
     Raises:
         ValueError: no press can be scored.

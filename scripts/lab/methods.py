@@ -17,7 +17,7 @@ from torchvts.compensate import Compensate
 from torchvts.integration import AdaptiveIntegration, PerspectiveIntegration, PoissonDST
 from torchvts.model import Calibration, ResponseModel, Sensor
 from torchvts.normals import NormalFromIntensity, NormalFromLookup, NormalFromMLP
-from torchvts.pipeline import DepthOutput, DepthPipeline
+from torchvts.pipeline import DepthOutput, DepthPipeline, Shadows
 from torchvts.scenes import render, sphere_press
 from torchvts.training.presses import Training, quiet_calibrate, train_network, training_pixels
 
@@ -146,8 +146,14 @@ def _plain_inverse(calibration: Calibration) -> Built:
         raise ValueError("calibration: expected one by lights, got response fields")
     size = (sensor.height, sensor.width)
     normals = NormalFromIntensity(lights, *size, sensor.mm_per_pixel, noise_std=torch.zeros(3), inverse=calibration.inverse)
-    normals.takes_noise = False  # that of a frame would make channels dark
     return pipeline(calibration, "precise", normals=normals)
+
+
+def _shadows(calibration: Calibration) -> Built:
+    """Mode precise that settles what dark channels mean."""
+    pipe = DepthPipeline.from_calibration(calibration, "precise")
+    pipe.refine = Shadows(pipe.refine, pipe.mm_per_pixel)
+    return Built(pipe.freeze(), parameters(calibration, "precise"))
 
 
 def _blurred(calibration: Calibration) -> Built:
@@ -268,7 +274,7 @@ METHODS: dict[str, Method] = {
             partial(by_calibration, mode="precise"),
             {"color": "#d55e00", "lw": 2.2},
         ),
-        Method("auto", partial(pipeline, mode="auto"), style={"color": "#e69f00", "lw": 1.6, "ls": (0, (4, 1))}),
+        Method("precise, shadows", _shadows, style={"color": "#e69f00", "lw": 1.6, "ls": (0, (4, 1))}),
         Method("fast, zero border", _integrated("fast", PoissonDST), style={"color": "#56b4e9", "lw": 1.6, "ls": "--"}),
         Method("fast, SciPy's DCT", _integrated("fast", PoissonSciPy), ours=False, needs_module="scipy"),
         Method("fast, PyTorch reference", _reference),

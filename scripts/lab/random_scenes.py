@@ -62,7 +62,7 @@ def random_frame(seed: int, unit: str | None = None, shape: str | None = None) -
         ValueError: unknown unit or shape.
     Example:
         >>> frame = random_frame(1, "lights known", "sphere")
-        >>> frame.image.shape[1], frame.mode in ("fast", "precise", "auto")
+        >>> frame.image.shape[1], frame.mode in ("fast", "precise")
         (3, True)
     """
     draw = random.Random(seed)
@@ -81,7 +81,7 @@ def random_frame(seed: int, unit: str | None = None, shape: str | None = None) -
             calibration = calibrate(background, camera.sensor)
         else:
             calibration = Calibration.from_lights(camera.lights, camera.sensor, None if unit == UNITS[0] else background)
-    mode = draw.choice(["fast", "precise", "precise", "auto"])
+    mode = draw.choice(["fast", "precise", "precise"])
     return RandomFrame(unit, shape, calibration, mode, scene, camera.photograph(scene, 10 * seed))
 
 

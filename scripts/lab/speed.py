@@ -28,7 +28,7 @@ from .score import score_press
 GS_SDK = "gs_sdk's pipeline"
 
 TIMED = (
-    "fast", "precise", "auto", "fast, zero border", "fast, SciPy's DCT", "fast, PyTorch reference", "flat", "look-up table",
+    "fast", "precise", "fast, zero border", "fast, SciPy's DCT", "fast, PyTorch reference", "flat", "look-up table",
 )  # fmt: skip
 """Methods that are timed on exact scenes."""
 

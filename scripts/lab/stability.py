@@ -21,7 +21,7 @@ from .metrics import depth_error, mask_iou, normal_angle_deg
 from .rows import Row
 
 SWEPT = (
-    "flat", "fast", "precise", "auto", "fast, zero border", "precise, plain inverse", "precise, blur 1 px",
+    "flat", "fast", "precise", "precise, shadows", "fast, zero border", "precise, plain inverse", "precise, blur 1 px",
     "precise, discontinuities", "precise, pinhole",
 )  # fmt: skip
 """Names of the methods that are measured."""

@@ -314,7 +314,7 @@ def test_depth_is_refused_where_nothing_is_known_about_it():
         block(image, depth)
 
 
-@pytest.mark.parametrize("mode", ["precise", "auto"])
+@pytest.mark.parametrize("mode", ["fast", "precise"])
 @pytest.mark.parametrize("by_depth", [None, random_by_depth(2, 1.4)])
 def test_normals_of_the_output_are_those_of_the_depth(mode, by_depth):
     """Also of a unit of whose depth nothing is known: its second pass is integration alone."""

@@ -21,7 +21,6 @@ def row(method, ms, rms_um, kind="scene", height=480, data="sphere R 10 mm, pres
 ROWS = [
     row("fast", 1.0, 3.0),
     row("precise", 2.0, 1.0),
-    row("auto", 3.0, 2.0),
     row("flat", 0.1, 500.0),
     row(speed.GS_SDK, 9.0, None),
 ]

@@ -19,7 +19,7 @@ def test_every_method_and_corruption_has_a_kept_breaking_point():
 
 
 ROBUST = "precise, discontinuities"
-QUICK = [pytest.param(name, ("fast", "auto"), id=f"{name}, fast and auto") for name in CORRUPTIONS]
+QUICK = [pytest.param(name, ("fast", "precise"), id=f"{name}, fast and precise") for name in CORRUPTIONS]
 ROBUSTLY = [
     pytest.param(name, (ROBUST,), id=f"{name}, {ROBUST}", marks=[] if name == "cut ends" else [pytest.mark.long])
     for name in CORRUPTIONS

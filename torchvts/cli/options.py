@@ -44,7 +44,7 @@ def add_background_frames(parser: argparse._ActionsContainer) -> None:
     )
 
 
-def add_mode(parser: argparse._ActionsContainer, default: str = "auto") -> None:
+def add_mode(parser: argparse._ActionsContainer, default: str = "fast") -> None:
     """``--mode``: of the pipeline."""
     parser.add_argument("--mode", choices=MODES, default=default, metavar="MODE", help=f"{', '.join(MODES)} ({default})")
 

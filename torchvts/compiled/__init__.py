@@ -2,6 +2,6 @@
 
 from .binding import library, why_no_library
 from .blocks import NotCompiled, check_block
-from .plan import IN_PYTORCH, Plan, ends
+from .plan import Plan, ends
 
-__all__ = ["IN_PYTORCH", "NotCompiled", "Plan", "check_block", "ends", "library", "why_no_library"]
+__all__ = ["NotCompiled", "Plan", "check_block", "ends", "library", "why_no_library"]

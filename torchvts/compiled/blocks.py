@@ -6,12 +6,11 @@ import torch
 from torch import Tensor, nn
 
 from ..compensate import AsItIs, Compensate, Relight
-from ..compensate.compensate import Blur, Gain
+from ..compensate.compensate import Blur, Gain, Linearise
 from ..compensate.defects import FillDefects
 from ..core.blur import gaussian_weights
 from ..core.cells import whole_cell_means
 from ..core.geometry import CLIFF_SLOPE, MAX_SLOPE, GradientFromNormal
-from ..core.noise import sample_stride
 from ..integration import PoissonBackground, PoissonDCT
 from ..normals import NormalFromIntensity, NormalFromResponse
 from ..normals import shadowed as shadowed_module
@@ -21,6 +20,9 @@ from ..skin import pressure as pressure_module
 from ..skin import weight as weight_module
 from ..skin import zero as zero_module
 from .plan import Values, poisson_tables
+
+LIGHTS = 8193
+"""Values of a camera whose light stands in a table: between them light^2.2 is a line to 5e-9."""
 
 DEGREES = (2, 4, 6)
 """Degrees for which response.c has loops."""
@@ -76,7 +78,7 @@ def _floats(values: object, dtype: torch.dtype = torch.float32) -> Tensor:
 
 
 def compensate_values(block: nn.Module, size: tuple[int, int]) -> Values:
-    """Of :class:`Compensate`, but for what stands before linear light, which PyTorch does."""
+    """Of :class:`Compensate`, but for the markers, which PyTorch fills."""
     check_block("compensate", block, Compensate)
     assert isinstance(block, Compensate)
     gain = block.gain
@@ -84,7 +86,7 @@ def compensate_values(block: nn.Module, size: tuple[int, int]) -> Values:
     offset = None if gain.offset is None else _map("compensate.gain.offset", gain.offset, size)
     pedestal = _pedestals(gain.gain, offset)
     none = torch.zeros(0, dtype=torch.int64)
-    values: Values = {
+    values: Values = _light_values(block.linear) | {
         "gain": _map("compensate.gain.gain", gain.gain, size),
         "offset": offset if pedestal is None else None,
         "pedestal": torch.zeros(3, dtype=torch.float32) if pedestal is None else pedestal,
@@ -104,6 +106,19 @@ def compensate_values(block: nn.Module, size: tuple[int, int]) -> Values:
         elif isinstance(step, Blur) and step.std_px > 0.0:
             values |= {"blur": _floats(step.weights), "blur_taps": len(step.weights)}
     return values | _relight_values(block.relight, size)
+
+
+def _light_values(linear: nn.ModuleList) -> Values:
+    """The light of camera values, as a table, where the last step before linear light is the camera's gamma."""
+    if not ends_in_gamma(linear):
+        return {"light_of": None, "lights": 0}
+    check_block("compensate.linear", linear[-1], Linearise)
+    return {"light_of": linear[-1](torch.linspace(0.0, 1.0, LIGHTS, dtype=torch.float64)).float(), "lights": LIGHTS}
+
+
+def ends_in_gamma(linear: nn.ModuleList) -> bool:
+    """Whether the last step before linear light is the camera's gamma, which is compiled; what stands before it PyTorch does."""
+    return len(linear) > 0 and isinstance(linear[-1], Linearise)
 
 
 def _pedestals(gain: Tensor | None, offset: Tensor | None) -> Tensor | None:
@@ -168,12 +183,12 @@ def normals_values(name: str, model: nn.Module, gradient: nn.Module) -> Values:
 
 _LIGHTS = (
     "by_lights", "inverse", "flat_light", "saturated_above", "ill_conditioned", "any_ill_conditioned", "position", "albedo",
-    "per_camera_height", "noise_std", "measures_noise", "noise_stride", "prior_std", "brightness_noises", "least_brightness",
+    "per_camera_height", "noise_std", "prior_std", "brightness_noises", "least_brightness",
     "shadow_steps", "cliff_slope", "start_slope", "left_out", "failed_share",
 )  # fmt: skip
 _RESPONSE = ("field_place", "field", "degree", "terms", "per_mm", "steeper", "reference_mm", "max_sine")
 _NUMBERS = {
-    "by_lights", "any_ill_conditioned", "per_camera_height", "measures_noise", "noise_stride", "prior_std", "brightness_noises",
+    "by_lights", "any_ill_conditioned", "per_camera_height", "prior_std", "brightness_noises",
     "least_brightness", "shadow_steps", "cliff_slope", "start_slope", "left_out", "failed_share", "degree", "terms", "steeper",
     "reference_mm", "max_sine",
 }  # fmt: skip
@@ -200,7 +215,6 @@ def _lights_values(name: str, model: NormalFromIntensity) -> Values:
         "albedo": model.lights.albedo,
         "per_camera_height": 1.0 / model.camera_height_mm,
         "noise_std": shadowed.noise_std,
-        "noise_stride": sample_stride(height, width, model.samples),
         "prior_std": shadowed_module.PRIOR_STD,
         "brightness_noises": shadowed.brightness_noises,
         "least_brightness": shadowed.least_brightness,

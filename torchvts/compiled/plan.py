@@ -15,7 +15,7 @@ Values = dict[str, Any]
 DTYPES = {"float": torch.float32, "double": torch.float64, "int64_t": torch.int64, "uint8_t": torch.bool}
 """Of tables, by their type in C."""
 
-DONE, NO_MEMORY, IN_PYTORCH = 0, 1, 2
+DONE, NO_MEMORY = 0, 1
 """What the compiled frame returns: see csrc/plan.h."""
 
 
@@ -58,31 +58,25 @@ class Plan:
             return int(value) if kind == "i" else float(value)
         if value is None:
             return None
-        if isinstance(value, Plan):
-            self._kept.append(value)
-            return value.address
         if not isinstance(value, Tensor) or value.dtype != DTYPES[kind] or not value.is_cpu:
             raise TypeError(f"{name}: expected a tensor of {DTYPES[kind]} on the CPU, got {value!r:.100}")
         table = value.detach().contiguous().clone()
         self._kept.append(table)
         return table.data_ptr()
 
-    def reconstruct(self, image: Tensor, conditions: Tensor, output: tuple[Tensor, ...]) -> int:
+    def reconstruct(self, image: Tensor, conditions: Tensor, output: tuple[Tensor, ...]) -> None:
         """Reconstruct a frame.
 
         Args:
-            image: (3, H, W), linear light, contiguous float32 as all tensors here but for masks.
+            image: (3, H, W), its markers filled, contiguous float32 as all tensors here but for masks.
             conditions: (22,), gets the light (3, 6), what is lost (3), and the slope that could not be seen.
             output: depth (1, H, W), gradient (2, H, W), normal (3, H, W), contact and deformed (1, H, W), which get the result.
-        Returns:
-            ``DONE``; or ``IN_PYTORCH`` where the shadows of the frame must be read by PyTorch: then only ``conditions`` is set.
         Raises:
             MemoryError: memory is short.
         """
         parts = [part.data_ptr() for part in output]
         code = int(loaded().reconstruct(self.address, image.data_ptr(), conditions.data_ptr(), *parts))
         check_memory(code == NO_MEMORY)
-        return code
 
 
 def ends(values: Tensor) -> tuple[float, float]:

@@ -223,31 +223,6 @@ def check_same_count(name: str, tensor: Tensor, other_name: str, count: int) -> 
         )
 
 
-def check_noise(name: str, noise_std: Tensor, count: int) -> None:
-    """Raise unless ``noise_std`` is (``count``, 3), the noise of each channel of each frame, or (1, 3) for all frames. Scripts.
-
-    Example:
-        >>> check_noise("noise_std", torch.zeros(3), 1)
-        Traceback (most recent call last):
-        ...
-        ValueError: noise_std: expected (1, 3), noise of each channel of each frame, got [3]: add the batch dimension with [None]
-    """
-    if not torch.jit.is_scripting():
-        check_tensor(name, noise_std)
-    if noise_std.dim() != 2 or noise_std.shape[1] != 3:
-        cause = (
-            "add the batch dimension with [None]" if noise_std.dim() == 1 else "NormalFromIntensity.noise_of(compensated) gives it"
-        )
-        raise ValueError(
-            f"{name}: expected ({count}, 3), noise of each channel of each frame, got {list(noise_std.shape)}: {cause}"
-        )
-    if not noise_std.is_floating_point():
-        raise TypeError(f"{name}: expected a floating-point tensor, got {noise_std.dtype}: images are value / 255 in [0, 1]")
-    if noise_std.dtype != torch.float32 and noise_std.dtype != torch.float64:
-        raise TypeError(f"{name}: expected float32 or float64, got {noise_std.dtype}: use .float()")
-    check_same_count(name, noise_std, "compensated", count)
-
-
 def may_read_values() -> bool:
     """Whether Python may branch on values of tensors: always, except while torch.export or torch.compile traces. Scripts."""
     if torch.jit.is_scripting():

@@ -11,12 +11,10 @@ class Frame(NamedTuple):
     Attributes:
         image: (B, 3, H, W), compensated.
         weight: (B, 1, H, W) in [0, 1], how surely the skin has moved.
-        noise_std: (B, 3), noise of each frame's compensated image; None where the model of normals does not ask for it.
     """
 
     image: Tensor
     weight: Tensor
-    noise_std: Tensor | None
 
 
 class Solution(NamedTuple):

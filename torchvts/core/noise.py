@@ -28,29 +28,7 @@ def noise_std(image: Tensor, samples: int = 8000) -> Tensor:
         True
     """
     second = second_differences(image, samples)
-    return noise_from(second, std_of_median(second.median(dim=-1, keepdim=True).values))
-
-
-def noise_of_spotted(image: Tensor, samples: int = 8000) -> Tensor:
-    """The same from the quarter of the pixels that differ least: three quarters may be spots, dead pixels or edges."""
-    second = second_differences(image, samples)
-    return noise_from(second, std_of_quarter(least_quarter(second)))
-
-
-def std_of_median(median: Tensor) -> Tensor:
-    """Standard deviation of Gaussian noise from the median of its absolute values."""
-    return median / 0.6745
-
-
-def std_of_quarter(quarter: Tensor) -> Tensor:
-    """The same from what :func:`least_quarter` gives of them."""
-    return quarter / 0.3186
-
-
-def least_quarter(values: Tensor) -> Tensor:
-    """The value below which a quarter of (B, C, N) lies, (B, C, 1)."""
-    # ONNX has no kthvalue
-    return values.topk(values.shape[2] // 4 + 1, dim=2, largest=False, sorted=False).values.amax(dim=2, keepdim=True)
+    return noise_from(second, second.median(dim=-1, keepdim=True).values / 0.6745)
 
 
 def sample_stride(height: int, width: int, samples: int) -> int:

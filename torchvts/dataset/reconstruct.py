@@ -69,7 +69,7 @@ def reconstruct_dataset(
     source: str | Path | Sequence[str | Path],
     out: str | Path,
     *,
-    mode: str = "auto",
+    mode: str = "fast",
     format: str = "npz",
     cloud: str = "none",
     length_unit: str = "mm",
@@ -97,7 +97,7 @@ def reconstruct_dataset(
         source: image, video, or folder with all below it, or several of these; hidden files, links to folders and results of runs
             are passed over.
         out: folder for results, made if missing.
-        mode: "fast", "precise" or "auto".
+        mode: "fast" or "precise".
         format: "npz" (depth, normals, gradient, masks, units; :func:`torchvts.read_result`), "video-npz" (the same, one file a
             video), "png16" (depth in 16 bits), "npy" (depth) or "none".
         cloud: contact as points, "ply" or "pcd", as a surface, "obj", or "none".

@@ -81,8 +81,6 @@ def export_torchscript(pipe: DepthPipeline, path: str | Path) -> Path:
 def export_program(pipe: DepthPipeline, path: str | Path | None = None) -> torch.export.ExportedProgram:
     """Trace a pipeline by torch.export, in any mode, for any batch, and write it (.pt2) for ``torch.export.load``.
 
-    Loops (precise passes, hole filling) become operators of the graph, so that the program takes as many turns as the pipeline.
-
     Without a path the program is returned and not written.
 
     Raises:

@@ -7,10 +7,9 @@ import torch
 from torch import Tensor, nn
 
 from ..core.checks import check_batch, check_dtype, check_same_size, check_size, check_switch
-from ..core.frame import Frame
 from ..integration import Integrator, PoissonDCT, divergence
 from ..integration.transforms import cosine_bases, fold, unfold
-from ..pipeline import Adaptive, DepthPipeline, Shadows
+from ..pipeline import DepthPipeline, Shadows
 
 MAX_BATCH = 1024
 """Largest batch that the graph formats accept."""
@@ -117,26 +116,17 @@ def trace(pipe: DepthPipeline, by_matrix: bool) -> torch.export.ExportedProgram:
 
 def _use_matrices(pipe: DepthPipeline, height: int, width: int, dtype: torch.dtype) -> None:
     """Replace the FFT solvers of a pipeline by matrix products."""
-    solve, policy = pipe.solve, pipe.refine
+    solve, refine = pipe.solve, pipe.refine
     if isinstance(solve.integrate, PoissonDCT):
         zero = solve.integrate.zero_in_background
         solve.integrate = PoissonBackgroundByMatrix(height, width, pipe.mm_per_pixel, dtype, zero)
-    if isinstance(policy, Shadows):
-        policy.residual_integrator = PoissonBackgroundByMatrix(height, width, pipe.mm_per_pixel, dtype)
-        policy = policy.policy
-    if isinstance(policy, Adaptive):
-        rows, columns = (len(range(policy.stride // 2, n, policy.stride)) for n in (height, width))
-        policy.coarse_integrate = PoissonBackgroundByMatrix(rows, columns, policy.stride * pipe.mm_per_pixel, dtype)
+    if isinstance(refine, Shadows):
+        refine.residual_integrator = PoissonBackgroundByMatrix(height, width, pipe.mm_per_pixel, dtype)
 
 
 @torch.no_grad()
 def _make_tables(pipe: DepthPipeline, images: Tensor) -> None:
     """Let each integrator make the tables of its size, which then are constants of the graph."""
     pipe(images)
-    policy = pipe.refine
-    if isinstance(policy, Shadows):
-        policy.residual_integrator(images[:, :2])
-        policy = policy.policy
-    if isinstance(policy, Adaptive):
-        frame = Frame(images, torch.ones_like(images[:, :1]), None)
-        policy.predicted_change_px(frame, pipe.solve(frame, torch.zeros_like(images[:, :1])))
+    if isinstance(pipe.refine, Shadows):
+        pipe.refine.residual_integrator(images[:, :2])

@@ -43,6 +43,9 @@ DEFECT_WINDOW_PX = 7
 PEDESTAL = 0.03
 """Added to image and background before response fields take their ratio: where an LED does not reach, a ratio is all noise."""
 
+UNKNOWN_NOISE = 0.003
+"""Noise in image value, three quarters of a grey level, of a camera of which there is no image."""
+
 SATURATED = 0.995
 """Image value from which a channel is saturated."""
 
@@ -160,7 +163,8 @@ class Calibration:
         Args:
             lights: the three lights.
             sensor: the sensor.
-            background: (3, H, W), image without contact in [0, 1], if there is one. It gives defects, gain and noise.
+            background: (3, H, W), image without contact in [0, 1], if there is one. It gives defects, gain and noise;
+                without one, :data:`UNKNOWN_NOISE` is assumed.
             report: kept with the calibration; model "point_lights" and source "given" unless it says otherwise.
             ambient: (3,), constant linear light per channel, at least 0; None for none.
         Raises:
@@ -185,7 +189,7 @@ class Calibration:
         if background is None:
             model = flat_image(frozen, sensor.height, sensor.width, sensor.mm_per_pixel)
             model = model if ambient is None else model + ambient.reshape(3, 1, 1)
-            noise = torch.full((3,), QUANTISATION_STD, dtype=model.dtype)
+            noise = torch.full((3,), UNKNOWN_NOISE, dtype=model.dtype)
             return cls(sensor, frozen, model, noise, False, summary, None, None, ambient)
         light, noise, markers = _measure(background, sensor, frozen.position_mm.dtype)
         return cls(sensor, frozen, light, noise, True, summary, None, markers, ambient)

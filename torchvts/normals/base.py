@@ -31,11 +31,10 @@ class NormalModel(nn.Module):
     """Base of modules that map compensated images to normals. A subclass declares what it can do and overrides ``forward``.
 
     Attributes:
-        uses_depth: ``forward`` makes use of a depth; needed for the modes "precise" and "auto" to go again.
+        uses_depth: ``forward`` makes use of a depth; needed for the mode "precise" to go again.
         normals_from_depth: all modes return the gradient of the depth: integration keeps only what is the slope of
             a surface, so it has less noise and smaller errors than the slopes of single pixels.
-        max_passes: passes after which nothing more is gained.
-        takes_noise: ``forward`` gets, as a third argument, what ``noise_of`` makes of the compensated image.
+        passes: how often mode "precise" solves a frame.
         calibrated: its slopes are the skin's, not those of a network that may still be in training: they count where the skin
             has moved, beside the colour. What a model gives that does not declare it is checked.
         input_domain: what ``forward`` works on, a key of :data:`DOMAINS`; a pipeline whose compensated images are something else
@@ -51,14 +50,13 @@ class NormalModel(nn.Module):
 
     uses_depth: bool = False
     normals_from_depth: bool = False
-    max_passes: int = 1000
-    takes_noise: bool = False
+    passes: int = 3
     calibrated: bool = False
     input_domain: str | None = None
 
     if TYPE_CHECKING:
 
-        def __call__(self, image: Tensor, depth_mm: Tensor | None = None, noise_std: Tensor | None = None) -> Tensor: ...
+        def __call__(self, image: Tensor, depth_mm: Tensor | None = None) -> Tensor: ...
 
     def forward(self, image: Tensor, depth_mm: Tensor | None = None) -> Tensor:
         """Normals of a compensated image.
@@ -70,15 +68,6 @@ class NormalModel(nn.Module):
             (B, 3, H, W), facing the camera; of unit length where a second pass is to use it.
         """
         raise TypeError(f"{type(self).__name__}: a NormalModel must define forward(image, depth_mm)")
-
-    def noise_of(self, compensated: Tensor) -> Tensor | None:
-        """Noise of each channel of compensated images (B, 3, H, W), (B, 3); for models that declare ``takes_noise``."""
-        return None
-
-    def coarse(self, stride: int) -> "NormalModel | None":
-        """The same model for an image of every ``stride``-th pixel, for the prediction of mode "auto"; None if there is none: then
-        "auto" solves every frame with deformed skin again."""
-        return None
 
 
 def declared_domain(module: nn.Module) -> str | None:

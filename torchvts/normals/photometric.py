@@ -10,7 +10,6 @@ from ..core.checks import (
     check_batch,
     check_camera_height,
     check_float_tensor,
-    check_integer,
     check_positive,
     check_record,
     check_same_count,
@@ -21,11 +20,10 @@ from ..core.checks import (
     reads_freely,
 )
 from ..core.geometry import normal_from_gradient, slope_of_depth
-from ..core.noise import noise_of_spotted
 from ..model.calibration import Calibration, check_calibration
 from ..model.lights import PointLights, flat_image, gloss_lobe, inverse_light_matrix, normal_at_depth
 from .base import NormalModel
-from .shadowed import SAMPLES, LightView, ShadowedPixels, matrix_in_view
+from .shadowed import LightView, ShadowedPixels, matrix_in_view
 
 GLOSS_STEPS = 3
 """Times that a first pass divides the lobe out, each at the slope of the last."""
@@ -46,8 +44,7 @@ class NormalFromIntensity(NormalModel):
         height: pixels.
         width: pixels.
         mm_per_pixel: pixel pitch, mm.
-        noise_std: (3,), noise of the compensated image; None takes that of 8-bit rounding. In modes precise and auto of
-            a pipeline, a frame that has more counts with its own (:meth:`noise_of`).
+        noise_std: (3,), noise of the compensated image; None takes that of 8-bit rounding.
         inverse: (3, 3, H, W), the stored inverse; None computes it.
         saturated_above: (3, H, W), compensated intensity from which a channel counts as saturated; None for never.
         camera_height_mm: of a pinhole camera above the image centre, which sees deep points nearer to its axis; infinite for an
@@ -61,7 +58,6 @@ class NormalFromIntensity(NormalModel):
     """
 
     uses_depth: bool = True
-    takes_noise: bool = True
     calibrated: bool = True
     input_domain: str | None = "light"
     inverse: Tensor
@@ -81,7 +77,6 @@ class NormalFromIntensity(NormalModel):
     ) -> None:
         super().__init__()
         self.gloss_steps = GLOSS_STEPS
-        self.samples = SAMPLES
         check_record("lights", lights, PointLights, "PointLights(position_mm, albedo) makes them")
         check_size(height, width, mm_per_pixel)
         self.mm_per_pixel = mm_per_pixel = check_positive("mm_per_pixel", mm_per_pixel)
@@ -126,20 +121,11 @@ class NormalFromIntensity(NormalModel):
             camera_height_mm=camera_height_mm,
         )
 
-    def forward(self, image: Tensor, depth_mm: Tensor | None = None, noise_std: Tensor | None = None) -> Tensor:
-        return self.solve(image, depth_mm, None, noise_std)
+    def forward(self, image: Tensor, depth_mm: Tensor | None = None) -> Tensor:
+        return self.solve(image, depth_mm, None)
 
     @torch.jit.export
-    def noise_of(self, compensated: Tensor) -> Tensor:
-        """Noise (B, 3) by which a channel of compensated images (B, 3, H, W) is dark: the calibrated one, or the frame's own where
-        that is larger, as with lights that are known without an image of the unit."""
-        check_batch("compensated", compensated, 3)
-        if compensated.shape[3] < 3:  # no second differences
-            return self.shadowed.noise_std.expand(compensated.shape[0], 3)
-        return torch.maximum(noise_of_spotted(compensated.detach(), self.samples), self.shadowed.noise_std)
-
-    @torch.jit.export
-    def solve(self, image: Tensor, depth_mm: Tensor | None, expected: Tensor | None, noise_std: Tensor | None = None) -> Tensor:
+    def solve(self, image: Tensor, depth_mm: Tensor | None, expected: Tensor | None) -> Tensor:
         """As ``forward``, but shadowed pixels start from the slopes ``expected`` (B, 2, H, W); a depth takes precedence."""
         check_batch("compensated", image, 3)
         if expected is not None:
@@ -156,10 +142,9 @@ class NormalFromIntensity(NormalModel):
             check_same_count("depth_mm", depth_mm, "compensated", image.shape[0])
         if image.shape[0] == 0:
             return image
-        noise_std = self.shadowed.noise_of_frames(noise_std, image)
         view = self.view()
         plain = self.inverted_glossy(image, depth_mm, view) if self.lights.glossy else self.inverted(image, depth_mm, view)
-        normal: Tensor = self.shadowed(plain, image, depth_mm, view, expected, noise_std)
+        normal: Tensor = self.shadowed(plain, image, depth_mm, view, expected)
         return normal
 
     def follow_lights(self) -> None:
@@ -228,20 +213,3 @@ class NormalFromIntensity(NormalModel):
         """Lights and camera."""
         gloss = self.lights.gloss if self.lights.glossy else None
         return LightView(self.lights.position_mm, self.lights.albedo, self.mm_per_pixel, self.camera_height_mm, gloss)
-
-    def coarse(self, stride: int) -> "NormalFromIntensity":
-        """The same for an image of every ``stride``-th pixel."""
-        check_integer("stride", stride, 1)
-        height, width = self.inverse.shape[2], self.inverse.shape[3]
-        rows, columns = len(range(stride // 2, height, stride)), len(range(stride // 2, width, stride))
-        coarse = type(self)(
-            self.lights,
-            rows,
-            columns,
-            self.mm_per_pixel * stride,
-            self.shadowed.noise_std,
-            saturated_above=self.shadowed.saturated_above[:, stride // 2 :: stride, stride // 2 :: stride],
-            camera_height_mm=self.camera_height_mm,
-        )
-        coarse.lights = self.lights  # one set of parameters
-        return coarse

@@ -29,7 +29,7 @@ class NormalFromResponse(NormalModel):
         tensor([0., 0., 1.])
     """
 
-    max_passes: int = 2
+    passes: int = 2
     normals_from_depth: bool = True
     calibrated: bool = True
     input_domain: str | None = "ratio"

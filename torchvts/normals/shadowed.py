@@ -5,13 +5,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from ..core.checks import check_noise, check_shape, may_read, may_read_values
+from ..core.checks import check_shape, may_read, may_read_values
 from ..core.geometry import gradient_from_normal, normal_from_gradient, slope_beside_cliff
 from ..core.noise import dark_below
 from ..model.lights import glossy_light, light_matrix, seen_at
-
-SAMPLES = 2000
-"""Pixels from which the noise of a frame is estimated."""
 
 LEFT_OUT = -1.0
 """Intensity of a channel that is left out at a pixel because something else than the skin's slope blocks its light. No camera gives
@@ -154,8 +151,7 @@ class ShadowedPixels(nn.Module):
 
     That is where a light that shines on the flat skin is dark, where a channel is saturated, and where the matrix is so
     ill-conditioned that its inverse makes more of the noise than slopes vary (``PRIOR_STD``). Where an LED has failed, the other
-    two and |n| = 1 are left, so all pixels go this way, starting from the flat skin. Methods take the noise of each frame,
-    ``noise_std`` (B, 3); None is that of the calibration.
+    two and |n| = 1 are left, so all pixels go this way, starting from the flat skin.
 
     Args:
         flat: (3, H, W), what the lights give on the flat skin.
@@ -184,53 +180,38 @@ class ShadowedPixels(nn.Module):
 
     def follow(self, flat: Tensor, inverse: Tensor) -> None:
         """Take over what depends on the lights: where the flat skin is lit, and where the matrix is ill-conditioned."""
-        noise = float(self.of_all_channels(self.noise_std[None]))
+        noise = float(self.of_all_channels())
         ill_conditioned = ~(noise * inverse.square().sum(dim=(0, 1)).sqrt() <= PRIOR_STD)  # infinite ones too
         self.any_ill_conditioned = bool(ill_conditioned.any())
         self.register_buffer("ill_conditioned", ill_conditioned)
         self.register_buffer("flat", flat.detach().clone())
 
-    def noise_of_frames(self, noise_std: Tensor | None, image: Tensor) -> Tensor:
-        """The noise of each frame (B, 3) of an image (B, 3, H, W), as it was given; else that of the calibration."""
-        if noise_std is None:
-            return self.noise_std.expand(image.shape[0], 3)
-        check_noise("noise_std", noise_std, image.shape[0])
-        return noise_std.expand(image.shape[0], 3)
-
-    def of_all_channels(self, noise_std: Tensor) -> Tensor:
-        """Root mean square of the channels' noise (B, 3): (B,)."""
-        return noise_std.square().mean(dim=1).sqrt().clamp_min(1e-6)
+    def of_all_channels(self) -> Tensor:
+        """Root mean square of the channels' noise, a scalar."""
+        return self.noise_std.square().mean().sqrt().clamp_min(1e-6)
 
     def brightness_std(self, noise: Tensor) -> Tensor:
         """Relative standard deviation of the brightness that all channels share, where their noise is so large."""
         return (self.brightness_noises * noise).clamp_min(self.least_brightness)
 
-    def nowhere_dark(self, image: Tensor, noise_std: Tensor) -> bool:
-        """Whether no channel of an image (B, 3, H, W) is below three times its noise (B, 3); where it is, ``dark`` says more."""
-        return bool((image.detach().amin(dim=(2, 3)) >= 3.0 * noise_std).all())
+    def nowhere_dark(self, image: Tensor) -> bool:
+        """Whether no channel of an image (B, 3, H, W) is below three times its noise; where it is, ``dark`` says more."""
+        return bool((image.detach().amin(dim=(2, 3)) >= 3.0 * self.noise_std).all())
 
-    def dark(self, image: Tensor, noise_std: Tensor) -> Tensor:
+    def dark(self, image: Tensor) -> Tensor:
         """Channels whose light is blocked, bool (B, 3, H, W); see :func:`~torchvts.core.noise.dark_below`."""
-        return image < dark_below(self.flat, 3.0 * noise_std[:, :, None, None])
+        return image < dark_below(self.flat, 3.0 * self.noise_std[:, None, None])
 
-    def all_valid(self, image: Tensor, noise_std: Tensor) -> bool:
+    def all_valid(self, image: Tensor) -> bool:
         """Whether no pixel of the image needs this module."""
         image = image.detach()
         if self.any_ill_conditioned:
             return False
         if float((image - self.saturated_above).amax()) >= 0.0:  # by subtraction, three times as fast as comparison
             return False
-        return self.nowhere_dark(image, noise_std) or not bool(self.dark(image, noise_std).any())
+        return self.nowhere_dark(image) or not bool(self.dark(image).any())
 
-    def forward(
-        self,
-        normal: Tensor,
-        image: Tensor,
-        depth_mm: Tensor | None,
-        view: LightView,
-        expected: Tensor | None,
-        noise_std: Tensor | None = None,
-    ) -> Tensor:
+    def forward(self, normal: Tensor, image: Tensor, depth_mm: Tensor | None, view: LightView, expected: Tensor | None) -> Tensor:
         """Normals (B, 3, H, W) with those replaced that the plain inverse got wrong.
 
         Args:
@@ -239,12 +220,10 @@ class ShadowedPixels(nn.Module):
             depth_mm: (B or 1, 1, H, W), the depth so far; its slopes are the start.
             view: lights and camera.
             expected: (B, 2, H, W), slopes to start from where there is no depth; None for those of ``normal``.
-            noise_std: (B, 3), of each frame; None for that of the calibration.
         """
-        noise = self.noise_of_frames(noise_std, image)
-        if may_read(image) and self.all_valid(image, noise):
+        if may_read(image) and self.all_valid(image):
             return normal
-        dark = self.dark(image, noise)
+        dark = self.dark(image)
         failed = failed_leds(dark)
         invalid = dark | (image >= self.saturated_above) | failed[:, :, None, None]
         wanted = invalid.any(dim=1) | self.ill_conditioned
@@ -267,7 +246,7 @@ class ShadowedPixels(nn.Module):
         rows = view.albedo[None, :, None] * to_light * (squared.rsqrt() / squared)
         intensity, lost = image[b, :, row, column], failed[b]
         saturated = (intensity >= self.saturated_above[:, row, column].t()) | lost | (intensity <= 0.5 * self.left_out)
-        std = self.of_all_channels(noise)[b]
+        std = self.of_all_channels().expand(len(start))
         pixels = Pixels(start, intensity * (~lost).to(intensity.dtype), rows, saturated, std, self.brightness_std(std), view.gloss)
         slope = slope_by_lit_lights(pixels)
         solution = normal_from_gradient(slope[:, :, None, None])[:, :, 0, 0]
@@ -275,39 +254,35 @@ class ShadowedPixels(nn.Module):
         return normal.permute(0, 2, 3, 1).index_put((b, row, column), solution).permute(0, 3, 1, 2)
 
     @torch.jit.export
-    def blocked(self, image: Tensor, noise_std: Tensor | None = None) -> Tensor:
+    def blocked(self, image: Tensor) -> Tensor:
         """Where one or two of the lights that shine on the flat skin are dark, (B, 1, H, W) bool; a failed LED is not counted."""
-        noise = self.noise_of_frames(noise_std, image)
-        if may_read(image) and self.nowhere_dark(image, noise):
+        if may_read(image) and self.nowhere_dark(image):
             return torch.zeros_like(image[:, 0:1], dtype=torch.bool)
-        dark = self.dark(image, noise)
+        dark = self.dark(image)
         return (dark & ~failed_leds(dark)[:, :, None, None]).any(dim=1, keepdim=True)
 
     @torch.jit.export
-    def undeformed_in_shadow(self, image: Tensor, noise_std: Tensor | None = None) -> Tensor:
+    def undeformed_in_shadow(self, image: Tensor) -> Tensor:
         """Where one channel is dark and the two others are unchanged, bool (B, 1, H, W).
 
         The skin may be undeformed there, in a shadow of the object; or it has the one slope that looks the same.
         """
-        dark = self.dark(image, self.noise_of_frames(noise_std, image))
-        return ~self.changed(image, noise_std) & (dark.to(torch.uint8).sum(dim=1, keepdim=True) == 1)
+        dark = self.dark(image)
+        return ~self.changed(image) & (dark.to(torch.uint8).sum(dim=1, keepdim=True) == 1)
 
     @torch.jit.export
-    def changed(self, image: Tensor, noise_std: Tensor | None = None) -> Tensor:
+    def changed(self, image: Tensor) -> Tensor:
         """Where channels that are not dark differ from the undeformed skin's by more than their noise, bool (B, 1, H, W)."""
-        noise = self.noise_of_frames(noise_std, image)
-        change = ((image - self.flat) / noise[:, :, None, None]).masked_fill(self.dark(image, noise), 0.0)
+        change = ((image - self.flat) / self.noise_std[:, None, None]).masked_fill(self.dark(image), 0.0)
         return change.square().sum(dim=1, keepdim=True) > self.unchanged_noises**2
 
     @torch.jit.export
-    def without_dark(self, image: Tensor, noise_std: Tensor | None = None) -> Tensor:
+    def without_dark(self, image: Tensor) -> Tensor:
         """The image (B, 3, H, W) with dark channels left out, as where something else than the skin's slope blocks the light."""
-        return image.masked_fill(self.dark(image, self.noise_of_frames(noise_std, image)), self.left_out)
+        return image.masked_fill(self.dark(image), self.left_out)
 
     @torch.jit.export
-    def mirrored(
-        self, gradient: Tensor, image: Tensor, depth_mm: Tensor, view: LightView, noise_std: Tensor | None = None
-    ) -> Tensor:
+    def mirrored(self, gradient: Tensor, image: Tensor, depth_mm: Tensor, view: LightView) -> Tensor:
         """Slopes that fit as well where one light is blocked, but lie beyond the plane of the other two.
 
         Two lights and |n| = 1 leave a normal and its mirror image. On walls the one beyond the plane is right, and no start near a
@@ -318,12 +293,11 @@ class ShadowedPixels(nn.Module):
             image: (B, 3, H, W), compensated.
             depth_mm: (B, 1, H, W).
             view: lights and camera.
-            noise_std: (B, 3), of each frame; None for that of the calibration.
         Returns:
             (B, 2, H, W); as they are elsewhere.
         """
         matrix = matrix_in_view(depth_mm, view)
-        dark = self.dark(image, self.noise_of_frames(noise_std, image))
+        dark = self.dark(image)
         dark = dark & ~failed_leds(dark)[:, :, None, None]
         one = dark.to(torch.uint8).sum(dim=1, keepdim=True) == 1
         normal = normal_from_gradient(gradient)

@@ -5,7 +5,7 @@ from .conditions import UNEVEN, UNSEEN_DEG, doubts_of, light_levels, light_uneve
 from .confidence import Confidence, ConfidentOutput, ConfidentPipeline, bound_at
 from .depth import MODES, DepthPipeline
 from .frozen import FrozenPipeline
-from .refine import Adaptive, Once, Repeat, SlopesOfDepth, SlopesOfPixels
+from .refine import Refine, SlopesOfDepth, SlopesOfPixels
 from .shadows import Shadows
 from .solve import Solve
 from .unit import unit_pipeline
@@ -14,7 +14,6 @@ __all__ = [
     "MODES",
     "UNEVEN",
     "UNSEEN_DEG",
-    "Adaptive",
     "Conditions",
     "Confidence",
     "ConfidentOutput",
@@ -22,8 +21,7 @@ __all__ = [
     "DepthOutput",
     "DepthPipeline",
     "FrozenPipeline",
-    "Once",
-    "Repeat",
+    "Refine",
     "Shadows",
     "SlopesOfDepth",
     "SlopesOfPixels",

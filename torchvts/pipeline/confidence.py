@@ -286,16 +286,14 @@ class Confidence(nn.Module):
         """
         self._check(images, compensated, out)
         sigma = self._noise_of(images)
-        own_noise = self._own_noise(compensated)
-        base = self._normals(compensated, None, own_noise)
-        again = self._normals(compensated, out.depth_mm, own_noise) if self.uses_depth else base
+        base = self.normals(compensated, None)
+        again = self.normals(compensated, out.depth_mm) if self.uses_depth else base
         n_z = out.normal[:, 2:3]
         steep = n_z.square()  # an error of slope turns the normal by so much, at most along one axis
-        noise, model = self._through_the_inverse(base, compensated, sigma, own_noise)
+        noise, model = self._through_the_inverse(base, compensated, sigma)
         if self.by_lights:
             shadowed = self.normals.shadowed
-            dark = shadowed.dark(compensated, shadowed.noise_of_frames(own_noise, compensated))
-            dark = dark | (compensated >= shadowed.saturated_above)
+            dark = shadowed.dark(compensated) | (compensated >= shadowed.saturated_above)
             noise = noise * self._unexplained(compensated, out.depth_mm, again, dark, sigma)
             model = model * (2.0 - 2.0 * n_z) + self.clipped_variance * dark.any(dim=1, keepdim=True).to(noise.dtype)
         else:
@@ -377,23 +375,14 @@ class Confidence(nn.Module):
             return noise
         return noise.masked_fill((images <= self.black) | (images >= self.saturated), self.usual_change)
 
-    def _own_noise(self, compensated: Tensor) -> Tensor | None:
-        """The noise of each frame (B, 3) that its normals get, if they ask for it."""
-        return self.normals.noise_of(compensated) if self.by_lights else None
-
-    def _normals(self, compensated: Tensor, depth_mm: Tensor | None, own_noise: Tensor | None) -> Tensor:
-        return self.normals(compensated, depth_mm, own_noise) if self.by_lights else self.normals(compensated, depth_mm)
-
-    def _through_the_inverse(
-        self, base: Tensor, compensated: Tensor, sigma: Tensor, own_noise: Tensor | None
-    ) -> tuple[Tensor, Tensor]:
+    def _through_the_inverse(self, base: Tensor, compensated: Tensor, sigma: Tensor) -> tuple[Tensor, Tensor]:
         """Variances along one axis of the angle, radians^2, by noise and by the light's error."""
         noise = torch.zeros_like(base[:, 0:1])
         model = torch.zeros_like(noise)
         for k in range(3):
             step = torch.zeros_like(compensated)
             step[:, k : k + 1] = sigma[:, k : k + 1]
-            turn = 0.5 * (self._normals(compensated + step, None, own_noise) - base).square().sum(1, keepdim=True)
+            turn = 0.5 * (self.normals(compensated + step, None) - base).square().sum(1, keepdim=True)
             noise = noise + turn
             model = model + turn * (self.light_std[k : k + 1] / sigma[:, k : k + 1]).square()
         return noise, model

@@ -10,8 +10,6 @@ from ..compensate import Compensate, unchanged_light
 from ..core.checks import (
     check_batch,
     check_choice,
-    check_integer,
-    check_least,
     check_pitch,
     check_positive,
     check_range,
@@ -20,13 +18,12 @@ from ..core.checks import (
 from ..core.frame import Conditions, DepthOutput, Frame, Solution
 from ..core.geometry import GradientFromNormal, normal_from_gradient
 from ..core.settings import check_settings, settings_as_tensor
-from ..integration import PoissonBackground, PoissonDCT, WrappedIntegrator, as_integrator
+from ..integration import PoissonDCT, WrappedIntegrator, as_integrator
 from ..model import Calibration, Sensor, check_calibration
 from ..normals import NormalFromIntensity, NormalFromResponse, WrappedNormals, as_normal_model, check_domain
 from ..skin import ContactFromDepth, ContactMask, ContactSettings, ZeroBackground, moved, unseen_deg
 from .gs_sdk import gs_sdk_blocks
-from .refine import Adaptive, Once, Repeat, SlopesOfDepth, SlopesOfPixels
-from .shadows import Shadows
+from .refine import Refine, SlopesOfDepth, SlopesOfPixels
 from .solve import Solve
 
 if TYPE_CHECKING:
@@ -34,21 +31,16 @@ if TYPE_CHECKING:
 
 _Module = TypeVar("_Module", bound=nn.Module)
 
-MODES = ("fast", "precise", "auto")
-"""Modes of a pipeline: one solve; solved again with the depth found; solved again where that changes the depth."""
-
-STRIDE = 8
-"""Mode "auto" predicts on every so many pixels."""
+MODES = ("fast", "precise")
+"""Modes of a pipeline: one solve; solved again with the depth found."""
 
 
 class DepthPipeline(nn.Module):
     """Images (B, 3, H, W) to a :class:`DepthOutput`: compensate, smooth, solve, mask, refine, contact, slopes.
 
-    ``fast`` solves once (eq. 9). ``precise`` solves again with the depth found (eq. 10), until what is still missing falls below
-    ``tolerance_px``; for response fields gradient and normals are those of the depth, in all modes. ``auto`` predicts on every
-    eighth pixel what a second pass would change, and solves only those frames again for which that exceeds
-    ``refine_threshold_px``, until what is missing is below a fifth of it; where there are two passes at most, as for response
-    fields, it solves each frame twice. All modes divide out how the light of a frame differs from the background's.
+    ``fast`` solves once (eq. 9). ``precise`` solves again with the depth found (eq. 10): three passes by lights, two by response
+    fields, of which gradient and normals are those of the depth, in both modes. Both divide out how the light of a frame differs
+    from the background's.
     Frames of a batch do not influence one another; their number may change the rounding of sums. This is a plain PyTorch module:
     it trains, exports and runs on a GPU. For a camera or a recording, :meth:`freeze` it.
 
@@ -61,17 +53,13 @@ class DepthPipeline(nn.Module):
         gradient: normals to gradient.
         integrate: an :class:`~torchvts.integration.Integrator`, or any module from a gradient (B, 2, H, W) to depth (B, 1, H, W).
         mm_per_pixel: pixel pitch, mm.
-        mode: "fast", "precise" or "auto".
-        tolerance_px: change of depth still missing at which "precise" stops, as a multiple of the pitch.
-        refine_threshold_px: predicted change of depth from which "auto" solves a frame again, as a multiple of the pitch.
-        max_passes: bound on all passes.
+        mode: "fast" or "precise".
         contact: depth and deformed area to contact, bool (B, 1, H, W); None for :class:`ContactFromDepth`.
     Source:
         figure 2 and eq. 3-10 of the paper.
     """
 
     takes_slopes: Final[bool]
-    measures_noise: Final[bool]
 
     def __init__(
         self,
@@ -83,9 +71,6 @@ class DepthPipeline(nn.Module):
         *,
         mm_per_pixel: float,
         mode: str = "fast",
-        tolerance_px: float = 0.002,
-        refine_threshold_px: float = 0.05,
-        max_passes: int = 8,
         contact: nn.Module | None = None,
     ) -> None:
         super().__init__()
@@ -94,12 +79,10 @@ class DepthPipeline(nn.Module):
         given = {"compensate": compensate, "mask": mask, "gradient": gradient, "contact": touching}
         for name, block in given.items():
             check_record(name, block, nn.Module)
-        mm_per_pixel, tolerance_px = check_positive("mm_per_pixel", mm_per_pixel), check_positive("tolerance_px", tolerance_px)
+        mm_per_pixel = check_positive("mm_per_pixel", mm_per_pixel)
         model, integrator = as_normal_model(normals), as_integrator(integrate, mm_per_pixel)
         check_pitch("normals", model, mm_per_pixel)
         check_domain(model, compensate.output_domain if isinstance(compensate, Compensate) else None)
-        refine_threshold_px = check_least("refine_threshold_px", refine_threshold_px)
-        check_integer("max_passes", max_passes, 1)
         if mode == "precise" and not (model.uses_depth or model.normals_from_depth):
             raise ValueError(
                 f"mode: 'precise' hands the depth back to the normals, but {type(normals).__name__} does not take it: "
@@ -112,8 +95,7 @@ class DepthPipeline(nn.Module):
         self.solve = Solve(model, gradient, integrator, ZeroBackground(mm_per_pixel))
         own = isinstance(mask, ContactMask) and type(mask).forward is ContactMask.forward
         self.takes_slopes = own and model.calibrated
-        self.measures_noise = self.solve.takes_noise and mode != "fast"
-        self.refine = self._policy(mode, tolerance_px, refine_threshold_px, min(max_passes, model.max_passes))
+        self.refine = Refine(self.solve, model.passes if mode == "precise" and model.uses_depth else 1)
         self.slopes = SlopesOfDepth(mm_per_pixel) if model.normals_from_depth else SlopesOfPixels()
         self.contact = touching
 
@@ -124,24 +106,6 @@ class DepthPipeline(nn.Module):
                 "DepthPipeline.from_calibration"
             )
         super().__setattr__(name, value)
-
-    def _policy(self, mode: str, tolerance_px: float, refine_threshold_px: float, max_passes: int) -> nn.Module:
-        """The refinement of a mode: Once, Repeat, Adaptive; around it for lights Shadows."""
-        model, pitch = self.solve.normals, self.mm_per_pixel
-        if mode == "fast" or not model.uses_depth:
-            return Once()
-        predicts = mode == "auto" and max_passes > 2  # to solve once more costs less than to predict whether that pays
-        coarse = model.coarse(STRIDE) if predicts else None
-        if mode == "auto":
-            tolerance_px = max(tolerance_px, 0.2 * refine_threshold_px)
-        if coarse is None:
-            policy = Repeat(self.solve, pitch, tolerance_px, max_passes)
-        else:
-            grid = (coarse, PoissonBackground(STRIDE * pitch), pitch)
-            policy = Adaptive(self.solve, *grid, tolerance_px, max_passes, refine_threshold_px, STRIDE)
-        if not isinstance(model, NormalFromIntensity):
-            return policy
-        return Shadows(policy, PoissonBackground(pitch), pitch)
 
     @classmethod
     def from_calibration(
@@ -160,10 +124,10 @@ class DepthPipeline(nn.Module):
 
         Args:
             calibration: from :func:`calibrate`, :meth:`Calibration.from_lights` or :meth:`Calibration.load`.
-            mode: "fast", "precise" or "auto".
+            mode: "fast" or "precise".
             normals: module to put in place of the calibrated inverse model. It gets what that model would: the image scaled to the
                 light model's, or image / background for a response field. One that declares another ``input_domain`` is refused.
-                One that takes no depth is asked once a frame, in mode auto, too; precise refuses it.
+                Mode precise refuses one that takes no depth.
             integrate: module to put in place of PoissonDCT.
             contact: thresholds of what has moved and what touches; None for those of the unit.
         Raises:
@@ -204,7 +168,7 @@ class DepthPipeline(nn.Module):
             weights: gs_sdk's ``nnmodel.pth``, of which nothing but tensors is unpickled; or what ``torchvts train`` wrote.
             background: (3, H, W), image of the unit without contact in [0, 1], R, G, B; the network's gradients there are zero.
             sensor: the sensor, or what :meth:`Sensor.load` takes.
-            mode: "fast", or "auto", which is the same for a network without depth.
+            mode: "fast": a network takes no depth.
         Raises:
             FileNotFoundError: no such weights or sensor.
             ValueError, TypeError: no weights of such a network, or a background of another size, type or range.
@@ -243,8 +207,8 @@ class DepthPipeline(nn.Module):
         """Depth and slopes of a solution, and where the skin has moved and the object touches it."""
         deformed = moved(frame.weight.detach(), solution.depth_mm.detach())
         contact = self.contact(solution.depth_mm.detach(), deformed)
-        gradient, depth = self.slopes(frame, solution)
-        return DepthOutput(depth, gradient, normal_from_gradient(gradient), contact, deformed)
+        gradient = self.slopes(solution)
+        return DepthOutput(solution.depth_mm, gradient, normal_from_gradient(gradient), contact, deformed)
 
     @torch.jit.unused
     def freeze(self) -> "FrozenPipeline":
@@ -271,10 +235,9 @@ class DepthPipeline(nn.Module):
     def frame_of(self, images: Tensor) -> tuple[Frame, Tensor]:
         """The frame of checked images (B, 3, H, W), compensated and weighted, and its slopes by eq. 9 and 5, (B, 2, H, W)."""
         image = self.compensate(images)
-        noise = self.noise_of(image)
-        slopes = self.solve.slopes(image, None, noise)
+        slopes = self.solve.slopes(image, None)
         weight = self.mask(image, slopes) if self.takes_slopes else self.mask(image)
-        return Frame(image, weight.to(image.dtype), noise), slopes
+        return Frame(image, weight.to(image.dtype)), slopes
 
     @torch.jit.unused
     def conditions(self, images: Tensor) -> Conditions:
@@ -287,14 +250,6 @@ class DepthPipeline(nn.Module):
         )
         _, slopes = self.frame_of(images)
         return Conditions(light, lost, self.mask.unseen_deg(slopes) if isinstance(self.mask, ContactMask) else unseen_deg(slopes))
-
-    def noise_of(self, compensated: Tensor) -> Tensor | None:
-        """The noise of each frame, where the model of normals asks for it.
-
-        Not in mode fast: of the two slopes that fit where a light is blocked, one pass cannot find the right one, so that nothing
-        is gained by more of such pixels.
-        """
-        return self.solve.normals.noise_of(compensated) if self.measures_noise else None
 
     __jit_unused_properties__: ClassVar[list[str]] = ["gradient", "integrate", "normals"]
 
@@ -324,8 +279,7 @@ class DepthPipeline(nn.Module):
         check_settings(self, state)
 
     def extra_repr(self) -> str:
-        once = ", one pass: normals take no depth" if self.mode == "auto" and isinstance(self.refine, Once) else ""
-        return f"mode={self.mode}{once}, mm_per_pixel={self.mm_per_pixel}"
+        return f"mode={self.mode}, mm_per_pixel={self.mm_per_pixel}"
 
 
 def eval_around(module: _Module, *given: nn.Module | None) -> _Module:

@@ -6,17 +6,15 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.autograd import forward_ad
 
 from ..compensate import Compensate
-from ..compiled import IN_PYTORCH, NotCompiled, Plan, check_block, ends, library, why_no_library
+from ..compiled import NotCompiled, Plan, check_block, ends, library, why_no_library
 from ..compiled import blocks as compiled
-from ..compiled.plan import Values
 from ..core.checks import check_batch, check_range, check_record, check_same_size, in_range
 from ..core.frame import Conditions, DepthOutput
-from ..normals import NormalFromIntensity
 from .depth import DepthPipeline
-from .refine import Adaptive, Once, Repeat, SlopesOfDepth, SlopesOfPixels
-from .shadows import Shadows
+from .refine import Refine, SlopesOfDepth, SlopesOfPixels
 from .solve import Solve
 
 SHAPES = (1, 2, 3, 1, 1)
@@ -31,8 +29,7 @@ class FrozenPipeline:
     threads as torch uses, and equal bit for bit those frames alone. Depth differs from the pipeline's by rounding: less than
     1e-5 mm, and up to 2e-3 mm where a light has failed or an image is saturated, so that slopes are hardly determined.
 
-    Markers and the camera's gamma are undone by PyTorch, before the compiled code. By lights, in modes precise and auto, frames in
-    which the object blocks a light go through PyTorch as a whole.
+    Markers are filled by PyTorch, before the compiled code.
 
     Args:
         pipe: the pipeline.
@@ -45,7 +42,7 @@ class FrozenPipeline:
         ValueError: parameters that record gradients. TypeError: no pipeline.
     """
 
-    __slots__ = ("_linear", "_pipe", "_plan", "_size", "compiled", "mm_per_pixel", "mode", "not_compiled")
+    __slots__ = ("_before", "_pipe", "_plan", "_size", "compiled", "mm_per_pixel", "mode", "not_compiled")
 
     compiled: bool
     not_compiled: str
@@ -53,7 +50,7 @@ class FrozenPipeline:
     mm_per_pixel: float
     _pipe: DepthPipeline
     _plan: Plan | None
-    _linear: nn.Sequential
+    _before: nn.Sequential
     _size: tuple[int, int]
 
     def __init__(self, pipe: DepthPipeline) -> None:
@@ -71,11 +68,14 @@ class FrozenPipeline:
                 plan, size = plan_of(own)
             except NotCompiled as error:
                 reason = str(error)
-        linear = own.compensate.linear if plan is not None and isinstance(own.compensate, Compensate) else ()
+        before: list[nn.Module] = []
+        if plan is not None and isinstance(own.compensate, Compensate):
+            steps = own.compensate.linear
+            before = list(steps[:-1] if compiled.ends_in_gamma(steps) else steps)
         given: dict[str, object] = {
             "_pipe": own,
             "_plan": plan,
-            "_linear": nn.Sequential(*linear),
+            "_before": nn.Sequential(*before),
             "_size": size,
             "compiled": plan is not None,
             "not_compiled": reason,
@@ -123,7 +123,8 @@ class FrozenPipeline:
                 seen = self._pipe.conditions(images)
             return self._in_pytorch(images), Conditions(*(part.clone() for part in seen))
         with torch.inference_mode():
-            light = self._linear(images).contiguous()
+            images = images.resolve_neg().contiguous()
+            filled = self._before(images).contiguous()
         count, size = images.shape[0], self._size
         kinds = (torch.float32, torch.float32, torch.float32, torch.bool, torch.bool)
         parts = [torch.empty(count, c, *size, dtype=kind, device="cpu") for c, kind in zip(SHAPES, kinds, strict=True)]
@@ -132,25 +133,22 @@ class FrozenPipeline:
         frames = range(count)
         if threads <= 1:
             for k in frames:
-                self._frame(k, images, light, parts, conditions)
+                self._frame(k, images, filled, parts, conditions)
         else:
             pool = ThreadPoolExecutor(threads, thread_name_prefix="torchvts")
             try:  # each thread holds what it works on, so that nothing is freed under it
-                list(pool.map(lambda k: self._frame(k, images, light, parts, conditions), frames))
+                list(pool.map(lambda k: self._frame(k, images, filled, parts, conditions), frames))
             finally:
                 _finish(pool)
         unseen = torch.rad2deg(torch.atan(conditions[:, 21]))
         return DepthOutput(*parts), Conditions(conditions[:, :18].reshape(count, 3, 6), conditions[:, 18:21], unseen)
 
-    def _frame(self, k: int, images: Tensor, light: Tensor, parts: list[Tensor], conditions: Tensor) -> None:
+    def _frame(self, k: int, images: Tensor, filled: Tensor, parts: list[Tensor], conditions: Tensor) -> None:
         """Check one frame of a batch, and write its output."""
         assert self._plan is not None
-        if not in_range(*ends(images[k].contiguous())):
+        if not in_range(*ends(images[k])):
             check_range("images", images)
-        if self._plan.reconstruct(light[k], conditions[k], tuple(part[k] for part in parts)) == IN_PYTORCH:
-            found = self._in_pytorch(images[k : k + 1])
-            for part, one in zip(parts, found, strict=True):
-                part[k].copy_(one[0])
+        self._plan.reconstruct(filled[k], conditions[k], tuple(part[k] for part in parts))
 
     def _in_pytorch(self, images: Tensor) -> DepthOutput:
         images = images.clone(memory_format=torch.contiguous_format)  # rounding depends on the layout
@@ -163,6 +161,8 @@ class FrozenPipeline:
         check_batch("images", images, 3)
         if images.requires_grad and torch.is_grad_enabled():
             raise ValueError("images: expected none that record gradients: a frozen pipeline does not; call the pipeline itself")
+        if forward_ad.unpack_dual(images).tangent is not None:  # type: ignore[no-untyped-call]
+            raise ValueError("images: expected none with a tangent: a frozen pipeline has no derivative; call the pipeline itself")
         if self._plan is None:
             return
         if images.dtype != torch.float32 or not images.is_cpu:
@@ -202,38 +202,12 @@ def plan_of(pipe: DepthPipeline) -> tuple[Plan, tuple[int, int]]:
     values |= compiled.solver_values("integrate", solve.integrate, values)
     values |= compiled.mask_values(pipe.mask, size, pipe.takes_slopes)
     values |= compiled.zero_values(solve.zero, size) | compiled.contact_values(pipe.contact, size)
-    values["measures_noise"] = pipe.measures_noise
     check_block("slopes", pipe.slopes, SlopesOfDepth, SlopesOfPixels)
     if isinstance(pipe.slopes, SlopesOfDepth):
         compiled.check_equal("slopes.mm_per_pixel", pipe.slopes.mm_per_pixel, pipe.mm_per_pixel)
     values["slopes_of_depth"] = isinstance(pipe.slopes, SlopesOfDepth)
-    return Plan(values | _policy_values(pipe, values)), size
-
-
-def _policy_values(pipe: DepthPipeline, values: Values) -> Values:
-    """Of the refinement."""
-    policy = pipe.refine
-    check_block("refine", policy, Once, Repeat, Adaptive, Shadows)
-    found: Values = {"passes": 1, "tolerance_px": 0.0, "coarse": None, "stride": 1, "threshold_px": 0.0, "shadows": False}
-    if isinstance(policy, Shadows):
-        found["shadows"] = True
-        policy = policy.policy
-        check_block("refine.policy", policy, Repeat, Adaptive)
-    if not isinstance(policy, Repeat):
-        return found
-    compiled.check_equal("refine.mm_per_pixel", policy.mm_per_pixel, pipe.mm_per_pixel)
-    if policy.solve is not pipe.solve:
+    check_block("refine", pipe.refine, Refine)
+    if pipe.refine.solve is not solve:
         raise NotCompiled("refine.solve is not that of the pipeline")
-    found |= {"passes": policy.max_passes, "tolerance_px": policy.tolerance_px}
-    if isinstance(policy, Adaptive):
-        stride, model = policy.stride, policy.coarse_normals
-        check_block("refine.coarse_normals", model, NormalFromIntensity)
-        coarse = values | compiled.normals_values("refine.coarse_normals", model, pipe.solve.gradient)
-        size = tuple(len(range(stride // 2, length, stride)) for length in (values["height"], values["width"]))
-        compiled.check_equal("refine.coarse_normals", (coarse["height"], coarse["width"]), size)
-        if min(size) > 1:  # else nothing is predicted
-            coarse |= compiled.solver_values("refine.coarse_integrate", policy.coarse_integrate, coarse)
-            coarse |= {**found, "measures_noise": False}
-            found["coarse"] = Plan(coarse)
-        found |= {"stride": stride, "threshold_px": policy.refine_threshold_px}
-    return found
+    values["passes"] = pipe.refine.passes
+    return Plan(values), size

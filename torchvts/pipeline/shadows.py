@@ -10,11 +10,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from ..core.checks import may_read_values
+from ..core.checks import check_positive, check_record, may_read_values
 from ..core.frame import Frame, Solution
 from ..core.geometry import slope_of_depth
-from ..integration import Integrator
-from .refine import Repeat
+from ..integration import Integrator, PoissonBackground
+from ..normals import NormalFromIntensity
+from .refine import Refine
 
 
 class Accepted(NamedTuple):
@@ -25,41 +26,59 @@ class Accepted(NamedTuple):
 
 
 class Shadows(nn.Module):
-    """A refinement policy that also settles what dark channels mean.
+    """A refinement that also settles what dark channels mean: put it in place of the pipeline's own, ``pipe.refine``.
 
-    Before the policy goes again: dark pixels are classified, first as undeformed skin in a cast shadow, then as pixels whose dark
+    Where LEDs are so low that an object casts shadows; frames without a blocked light pass as by :class:`Refine`. Before a frame is
+    solved again: dark pixels are classified, first as undeformed skin in a cast shadow, then as pixels whose dark
     channels are to be left out (dirt, or a shadow cast on a slope); and pixels with a blocked light restart from the slopes of
     their lit neighbours. After it: the normal mirrored at the plane of the two lit lights is tested. Each step is accepted
     where, and only in frames in which, integrability improves: slopes that make a surface agree with the slopes of the depth
     integrated from them.
 
     Args:
-        policy: how often frames are solved again.
-        residual_integrator: a solver that cuts no edges; one that does would make a surface of any slopes.
+        refine: of a pipeline of mode precise, by lights.
         mm_per_pixel: pixel pitch, mm.
         rounds: how often pixels are classified again beside those that were accepted.
+    Raises:
+        TypeError: no :class:`Refine`. ValueError: one whose normals are not made of lights.
     Source:
         Onn and Bruckstein, Integrability disambiguates surface recovery in two-image photometric stereo, IJCV 5(1), 1990.
+    Example:
+        >>> from torchvts import Calibration, DepthPipeline, PointLights, Sensor
+        >>> lights = PointLights([[20, 0, 8], [-10, 17, 8], [-10, -17, 8]], [200, 200, 200])
+        >>> cal = Calibration.from_lights(lights, Sensor("low LEDs", 48, 64, 0.2))
+        >>> pipe = DepthPipeline.from_calibration(cal, "precise")
+        >>> pipe.refine = Shadows(pipe.refine, pipe.mm_per_pixel)
+        >>> pipe(cal.model_image[None]).depth_mm.shape
+        torch.Size([1, 1, 48, 64])
     """
 
-    def __init__(self, policy: Repeat, residual_integrator: Integrator, mm_per_pixel: float, rounds: int = 3) -> None:
+    def __init__(self, refine: Refine, mm_per_pixel: float, rounds: int = 3) -> None:
         super().__init__()
-        self.policy = policy
-        self.residual_integrator = residual_integrator
-        self.mm_per_pixel = mm_per_pixel
+        check_record("refine", refine, Refine, 'pipe.refine of DepthPipeline.from_calibration(calibration, "precise") is one')
+        if not isinstance(refine.solve.normals, NormalFromIntensity):
+            raise ValueError(
+                f"refine: expected normals by lights, NormalFromIntensity, got {type(refine.solve.normals).__name__}: "
+                "only known lights say which channel a shadow blocks"
+            )
+        self.refine = refine
+        self.mm_per_pixel = check_positive("mm_per_pixel", mm_per_pixel)
+        # it cuts no edges, which would make a surface of any slopes
+        self.residual_integrator: Integrator = PoissonBackground(self.mm_per_pixel)
         self.rounds = rounds
 
     def forward(self, frame: Frame, solution: Solution) -> tuple[Frame, Solution]:
-        active = self.policy.unsettled(frame, solution)
-        blocked: Tensor = self.policy.solve.normals.shadowed.blocked(frame.image, frame.noise_std)
+        blocked: Tensor = self.refine.solve.normals.shadowed.blocked(frame.image)
         blocked = blocked & (frame.weight > 0.5)
-        has_shadow = active & blocked.flatten(1).any(dim=1)
-        if may_read_values() and not bool(has_shadow.any()):
-            return frame, self.policy.repeat(frame, solution, active)
-        frame, blocked, solution = self.classify_dark(frame, blocked, solution, has_shadow)
-        solution = self.restart_from_lit_neighbours(frame, blocked, solution, has_shadow)
-        solution = self.policy.repeat(frame, solution, active)
-        return frame, self.test_mirrored(frame, solution, has_shadow)
+        has_shadow = blocked.flatten(1).any(dim=1)
+        if not may_read_values() or bool(has_shadow.any()):
+            frame, blocked, solution = self.classify_dark(frame, blocked, solution, has_shadow)
+            solution = self.restart_from_lit_neighbours(frame, blocked, solution, has_shadow)
+            frame, solution = self.refine(frame, solution)
+            solution = self.test_mirrored(frame, solution, has_shadow)
+        else:
+            frame, solution = self.refine(frame, solution)
+        return frame, solution
 
     def classify_dark(
         self, frame: Frame, blocked: Tensor, solution: Solution, has_shadow: Tensor
@@ -70,43 +89,41 @@ class Shadows(nn.Module):
             The frame with its image and deformed area changed accordingly; where dark still means a slope that faces away; the
             solution.
         """
-        normals = self.policy.solve.normals
-        shadowed: Tensor = normals.shadowed.undeformed_in_shadow(frame.image, frame.noise_std) & blocked
+        normals = self.refine.solve.normals
+        shadowed: Tensor = normals.shadowed.undeformed_in_shadow(frame.image) & blocked
         flat = self.accept(frame, solution.gradient, torch.zeros_like(solution.gradient), shadowed, has_shadow)
         blocked = blocked & ~flat.where
-        without: Tensor = normals.shadowed.without_dark(frame.image, frame.noise_std)
+        without: Tensor = normals.shadowed.without_dark(frame.image)
         expected = torch.where(blocked, 0.0, flat.gradient)
-        other = self.policy.solve.gradient(normals.solve(without, None, expected, frame.noise_std))
+        other = self.refine.solve.gradient(normals.solve(without, None, expected))
         # walls of a pixel make no surface either
         rim = -nn.functional.max_pool2d(-frame.weight.detach(), 3, 1, 1) < 0.5
         cut = self.accept(frame, flat.gradient, other, blocked & ~rim, has_shadow)
-        frame = Frame(torch.where(cut.where, without, frame.image), frame.weight.masked_fill(flat.where, 0.0), frame.noise_std)
-        return frame, blocked & ~cut.where, self.policy.solve.integrated(frame, cut.gradient)
+        frame = Frame(torch.where(cut.where, without, frame.image), frame.weight.masked_fill(flat.where, 0.0))
+        return frame, blocked & ~cut.where, self.refine.solve.integrated(frame, cut.gradient)
 
     def restart_from_lit_neighbours(self, frame: Frame, blocked: Tensor, solution: Solution, has_shadow: Tensor) -> Solution:
         """Where a light is blocked, two slopes may fit: one near the plain inverse's, one near those of the lit pixels around."""
         height, width = frame.image.shape[2], frame.image.shape[3]
-        changed: Tensor = self.policy.solve.normals.shadowed.changed(frame.image, frame.noise_std)
+        changed: Tensor = self.refine.solve.normals.shadowed.changed(frame.image)
         lit = (frame.weight > 0.5) & changed & ~blocked  # flat skin beside a wall does not go on in it
         # some 30 x 40 cells, and of a thin or small image no more than 3,000: the work grows with their square
         cell = max(1, (min(height, width) + 15) // 30, math.ceil(math.sqrt(height * width / 3000.0)))
         expected = extrapolated_slope(solution.gradient, lit, cell)
-        normal = self.policy.solve.normals.solve(frame.image, None, expected, frame.noise_std)
-        other = self.policy.solve.integrated(frame, self.policy.solve.gradient(normal) * frame.weight)
+        normal = self.refine.solve.normals.solve(frame.image, None, expected)
+        other = self.refine.solve.integrated(frame, self.refine.solve.gradient(normal) * frame.weight)
         gained = self.residual(frame, other.gradient) - self.residual(frame, solution.gradient)
         return self.better(has_shadow, gained, other, solution)
 
     def test_mirrored(self, frame: Frame, solution: Solution, has_shadow: Tensor) -> Solution:
         """The same for the result and its mirror image beyond the plane of the two lit lights."""
-        solve, normals = self.policy.solve, self.policy.solve.normals
+        solve, normals = self.refine.solve, self.refine.solve.normals
         before = self.residual(frame, solution.gradient)
-        slope: Tensor = normals.shadowed.mirrored(
-            solution.gradient, frame.image, solution.depth_mm, normals.view(), frame.noise_std
-        )
-        other = self.policy.repeat(frame, solve.integrated(frame, slope * frame.weight), has_shadow)
+        slope: Tensor = normals.shadowed.mirrored(solution.gradient, frame.image, solution.depth_mm, normals.view())
+        _, other = self.refine(frame, solve.integrated(frame, slope * frame.weight))
         gained = self.residual(frame, other.gradient) - before
         slope = torch.where(nn.functional.avg_pool2d(gained, 17, 1, 8) < 0.0, other.gradient, solution.gradient)
-        other = self.policy.repeat(frame, solve.integrated(frame, slope), has_shadow)
+        _, other = self.refine(frame, solve.integrated(frame, slope))
         return self.better(has_shadow, self.residual(frame, other.gradient) - before, other, solution)
 
     def accept(self, frame: Frame, gradient: Tensor, other: Tensor, where: Tensor, has_shadow: Tensor) -> Accepted:

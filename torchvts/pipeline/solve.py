@@ -27,13 +27,11 @@ class Solve(nn.Module):
         zero: depth and weight to depth that counts from the undeformed skin.
     """
 
-    takes_noise: Final[bool]
     calibrated: Final[bool]
 
     def __init__(self, normals: NormalModel, gradient: nn.Module, integrate: Integrator, zero: nn.Module) -> None:
         super().__init__()
         self.normals = normals
-        self.takes_noise = normals.takes_noise
         self.calibrated = normals.calibrated
         self._axes_known = False  # asked of the first frame that shows a contact
         self.gradient = gradient
@@ -42,12 +40,12 @@ class Solve(nn.Module):
 
     def forward(self, frame: Frame, depth_mm: Tensor) -> Solution:
         """Solve a frame again with the depth so far, (B, 1, H, W): eq. 10."""
-        return self.integrated(frame, self.slopes(frame.image, depth_mm, frame.noise_std) * frame.weight)
+        return self.integrated(frame, self.slopes(frame.image, depth_mm) * frame.weight)
 
     @torch.jit.export
-    def slopes(self, image: Tensor, depth_mm: Tensor | None, noise_std: Tensor | None) -> Tensor:
+    def slopes(self, image: Tensor, depth_mm: Tensor | None) -> Tensor:
         """Slopes of all pixels of compensated images (B, 3, H, W), (B, 2, H, W); without depth eq. 9, with it eq. 10."""
-        normal = self.normals(image, depth_mm, noise_std) if self.takes_noise else self.normals(image, depth_mm)
+        normal = self.normals(image, depth_mm)
         if not torch.jit.is_scripting():
             self._check(normal, image)
         gradient: Tensor = self.gradient(normal.to(image.dtype))  # under autocast a network gives fewer bits

@@ -9,13 +9,13 @@ from .gs_sdk import gs_sdk_blocks
 
 
 def unit_pipeline(
-    calibration: Calibration, mode: str = "auto", network: str | Path | None = None, contact: ContactSettings | None = None
+    calibration: Calibration, mode: str = "fast", network: str | Path | None = None, contact: ContactSettings | None = None
 ) -> DepthPipeline:
     """The pipeline of a unit; with a network, its normals are the network's, on images as the camera gives them.
 
     Args:
         calibration: of the unit; with a network, its sensor and background are used.
-        mode: "fast", "precise" or "auto"; a network has no "precise".
+        mode: "fast" or "precise"; a network has no "precise".
         network: gs_sdk's ``nnmodel.pth``, or what ``torchvts train`` or ``NormalFromMLP.save`` wrote; None for the unit's model.
         contact: thresholds; None for the usual ones.
     Raises:

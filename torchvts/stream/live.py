@@ -64,7 +64,7 @@ class TactileStream:
     Args:
         source: a camera (:func:`find_camera`), a network camera's URL, a video file, a folder of images, or a :class:`Reader`.
         sensor_or_calibration: the sensor, which rectifies; or a calibration, if there is one.
-        mode: "fast", "precise" or "auto".
+        mode: "fast" or "precise".
         background_frames: number of frames without contact at the start; 0, with a calibration, uses that as it is.
         presses: of balls, to calibrate with; only without a calibration.
         realtime: play a recording at its own rate as if it were a camera.
@@ -95,7 +95,7 @@ class TactileStream:
         source: str | int | Path | Reader,
         sensor_or_calibration: Sensor | Calibration,
         *,
-        mode: str = "auto",
+        mode: str = "fast",
         background_frames: int = FIRST_FRAMES,
         presses: Sequence[Press] = (),
         realtime: bool = False,

@@ -69,7 +69,7 @@ class Recording:
 
     Args:
         calibration: of the unit.
-        mode: "fast", "precise" or "auto".
+        mode: "fast" or "precise".
         first: (N, 3, H, W), the first frames, rectified; None for none.
         network: a trained network in place of the calibration's model, see :func:`torchvts.pipeline.unit_pipeline`.
         device: of the pipeline, "cpu" or "cuda"; frames come and go on the CPU.
@@ -87,7 +87,7 @@ class Recording:
     def __init__(
         self,
         calibration: Calibration,
-        mode: str = "auto",
+        mode: str = "fast",
         first: Tensor | None = None,
         *,
         network: str | Path | None = None,

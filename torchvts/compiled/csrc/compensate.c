@@ -1,7 +1,18 @@
-/* From a camera's linear light to the compensated image: torchvts/compensate, which explains it. */
+/* From a camera's image to the compensated image: torchvts/compensate, which explains it. */
 #include "plan.h"
 
 #include <stdlib.h>
+
+/* Camera values in [0, 1] to linear light, by a table between whose entries light is a line. */
+WIDE void linearise(const Plan *plan, const float *image, float *light) {
+    const size_t n = 3 * (size_t)plan->height * plan->width;
+    const float *table = plan->light_of, last = (float)(plan->lights - 1);
+    for (size_t k = 0; k < n; k++) {
+        const float at = image[k] * last;
+        const int below = at < last - 1.0f ? (int)at : (int)last - 1;
+        light[k] = table[below] + (at - (float)below) * (table[below + 1] - table[below]);
+    }
+}
 
 /* image * gain + offset, either of which may be null; without offset image * gain + pedestal * gain. */
 WIDE static void multiply_add(const float *restrict image, const float *restrict gain, const float *restrict offset, float pedestal, int n,

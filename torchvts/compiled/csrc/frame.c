@@ -29,24 +29,10 @@ EXPORT WIDE void range(const float *values, int64_t n, float *ends) {
     ends[0] = low[0] + none[0], ends[1] = high[0] + none[0];
 }
 
-/* A frame on its way: compensated image (3, H, W), its noise, weight, slopes (2, H, W) and depth of the next pass. */
+/* A frame on its way: compensated image (3, H, W), weight, slopes (2, H, W). */
 typedef struct {
-    float noise[3], *light, *weight, *slopes, *depth;
+    float *light, *weight, *slopes;
 } Frame;
-
-/* The largest of |a - b|, or of |a|. */
-static WIDE float largest_change(const float *a, const float *b, size_t n) {
-    float most[16] = {0.0f};
-    size_t at = 0;
-    for (; at + 16 <= n; at += 16)
-        for (int k = 0; k < 16; k++) {
-            const float off = fabsf(a[at + k] - (b ? b[at + k] : 0.0f));
-            most[k] = off > most[k] ? off : most[k];
-        }
-    for (; at < n; at++) most[0] = fmaxf(most[0], fabsf(a[at] - (b ? b[at] : 0.0f)));
-    for (int k = 1; k < 16; k++) most[0] = fmaxf(most[0], most[k]);
-    return most[0];
-}
 
 static WIDE void times_weight(const float *restrict slopes, const float *restrict weight, size_t n, float *restrict gradient) {
     for (int c = 0; c < 2; c++)
@@ -55,7 +41,7 @@ static WIDE void times_weight(const float *restrict slopes, const float *restric
 
 /* Eq. 9, or with a depth eq. 10, and eq. 5: the slopes of a compensated image. */
 static void solve_slopes(const Plan *plan, Frame *frame, const float *depth, float *normal) {
-    find_normals(plan, frame->light, frame->noise, depth, normal);
+    find_normals(plan, frame->light, depth, normal);
     find_slopes(normal, (size_t)plan->height * plan->width, plan->max_slope, frame->slopes);
 }
 
@@ -66,63 +52,14 @@ static int solve_depth(const Plan *plan, const Frame *frame, float *gradient, fl
     return code == DONE ? zero_background(plan, frame->weight, depth) : code;
 }
 
-/* Every stride-th pixel of an image (height, width). */
-static float *coarsened(const Plan *plan, const float *image, float *to) {
-    const int stride = (int)plan->stride;
-    for (int64_t y = stride / 2; y < plan->height; y += stride)
-        for (int64_t x = stride / 2; x < plan->width; x += stride) *to++ = image[y * plan->width + x];
-    return to;
-}
-
-/* Adaptive.predicted_change_px(): what another pass would change, by every stride-th pixel. */
-static int predict_change(const Plan *plan, const Frame *frame, const float *gradient, const float *depth, float *change_px) {
-    const Plan *coarse = plan->coarse;
-    const size_t pixels = (size_t)plan->height * plan->width, n = (size_t)coarse->height * coarse->width;
-    float *light = malloc(13 * sizeof(float) * n);
-    if (!light) return NO_MEMORY;
-    float *to = light;
-    for (int c = 0; c < 3; c++) to = coarsened(plan, frame->light + pixels * c, to);
-    float *before = to, *z = before + 2 * n, *weight = z + n, *normal = weight + n, *slopes = normal + 3 * n, *found = light;
-    coarsened(plan, gradient, before), coarsened(plan, gradient + pixels, before + n);
-    coarsened(plan, depth, z), coarsened(plan, frame->weight, weight);
-    find_normals(coarse, light, frame->noise, z, normal);
-    find_slopes(normal, n, coarse->max_slope, slopes);
-    for (size_t k = 0; k < 2 * n; k++) slopes[k] = slopes[k] * weight[k % n] - before[k];
-    const int code = integrate(coarse, slopes, found);
-    *change_px = largest_change(found, NULL, n) / (float)plan->mm_per_pixel;
-    free(light);
-    return code;
-}
-
-/* Repeat and Adaptive of torchvts/pipeline/refine.py: solves again until what is still missing falls below the tolerance. */
-static int repeat(const Plan *plan, Frame *frame, float *gradient, float *normal, float *depth) {
-    const size_t pixels = (size_t)plan->height * plan->width;
-    const float pitch = (float)plan->mm_per_pixel;
-    float last_px = largest_change(depth, NULL, pixels) / pitch;
-    for (int pass = 1; pass < plan->passes; pass++) {
-        solve_slopes(plan, frame, depth, normal);
-        const int code = solve_depth(plan, frame, gradient, frame->depth);
-        if (code != DONE) return code;
-        const float change_px = largest_change(frame->depth, depth, pixels) / pitch;
-        const float ratio = fminf(fmaxf(change_px / fmaxf(last_px, 1e-12f), 0.0f), 0.9f);
-        memcpy(depth, frame->depth, sizeof(float) * pixels);
-        if (!(change_px * ratio / (1.0f - ratio) > (float)plan->tolerance_px)) break;
-        last_px = change_px;
-    }
-    return DONE;
-}
-
-/* Eq. 10, where the mode asks for it. */
+/* Eq. 10: solves again with the depth found, in place. */
 static int refine(const Plan *plan, Frame *frame, float *gradient, float *normal, float *depth) {
-    if (plan->passes < 2 && !plan->shadows) return DONE;
-    const int smallest = least((int)plan->height, (int)plan->width);
-    if (plan->coarse && smallest > plan->stride + plan->stride / 2) {
-        float change_px;
-        const int code = predict_change(plan, frame, gradient, depth, &change_px);
-        if (code != DONE || !(change_px > (float)plan->threshold_px)) return code;
+    int code = DONE;
+    for (int pass = 1; code == DONE && pass < plan->passes; pass++) {
+        solve_slopes(plan, frame, depth, normal);
+        code = solve_depth(plan, frame, gradient, depth);
     }
-    if (plan->shadows && any_blocked(plan, frame->light, frame->noise, frame->weight)) return IN_PYTORCH;
-    return repeat(plan, frame, gradient, normal, depth);
+    return code;
 }
 
 /* gradient_of_depth() of core/geometry.py. */
@@ -160,27 +97,26 @@ static int any_weight(const float *weight, size_t n) {
     return 0;
 }
 
-/* From linear light to slopes and weight; conditions: the light (3, 6), what is lost (3), the slope that could not be seen. */
+/* From the image to slopes and weight; conditions: the light (3, 6), what is lost (3), the slope that could not be seen. */
 static int begin(const Plan *plan, const float *image, Frame *frame, float *normal, float *conditions) {
     for (int k = 0; k < 22; k++) conditions[k] = k < 18 && k % 6 == 0;
-    int code = compensate(plan, image, conditions, frame->light);
-    for (int c = 0; c < 3; c++) frame->noise[c] = plan->by_lights ? plan->noise_std[c] : 0.0f;
-    if (code == DONE && plan->measures_noise) code = measure_noise(plan, frame->light, frame->noise);
+    if (plan->light_of) linearise(plan, image, normal), image = normal;
+    const int code = compensate(plan, image, conditions, frame->light);
     if (code != DONE) return code;
     solve_slopes(plan, frame, NULL, normal);
     return weigh(plan, frame->light, frame->slopes, conditions + 21, frame->weight);
 }
 
 /*
- * A frame. image (3, H, W), linear light; conditions (22), see begin(); depth (1, H, W), gradient (2, H, W), normal (3, H, W), contact and deformed
- * (1, H, W) bytes. Returns DONE, NO_MEMORY, or IN_PYTORCH for a frame whose shadows PyTorch must read.
+ * A frame. image (3, H, W), as the camera gives it but for its markers; conditions (22), see begin(); depth (1, H, W), gradient (2, H, W), normal (3, H, W), contact and deformed
+ * (1, H, W) bytes. Returns DONE or NO_MEMORY.
  */
 EXPORT int reconstruct(const Plan *plan, const float *image, float *conditions, float *depth, float *gradient, float *normal, uint8_t *contact,
                        uint8_t *deformed) {
     const size_t pixels = (size_t)plan->height * plan->width;
-    float *memory = malloc(7 * sizeof(float) * pixels);
+    float *memory = malloc(6 * sizeof(float) * pixels);
     if (!memory) return NO_MEMORY;
-    Frame frame = {{0.0f}, memory, memory + 3 * pixels, memory + 4 * pixels, memory + 6 * pixels};
+    Frame frame = {memory, memory + 3 * pixels, memory + 4 * pixels};
     int code = begin(plan, image, &frame, normal, conditions);
     if (code == DONE && !any_weight(frame.weight, pixels)) {
         undeformed(pixels, depth, gradient, normal, contact, deformed);

@@ -74,7 +74,7 @@ static Lights lights_of(const float *position, const float *albedo) {
     return lights;
 }
 
-static void by_lights(const Plan *plan, const float *light, const float *noise, const float *depth, float *normal) {
+static void by_lights(const Plan *plan, const float *light, const float *depth, float *normal) {
     const int height = (int)plan->height, width = (int)plan->width;
     const size_t pixels = (size_t)height * width;
     const float pitch = (float)plan->mm_per_pixel;
@@ -90,14 +90,15 @@ static void by_lights(const Plan *plan, const float *light, const float *noise, 
         else
             from_inverse(light + at, pixels, plan->inverse + at, pixels, width, to, to + pixels, to + 2 * pixels);
         for (int c = 0; c < 3; c++)
-            invalid |= any_invalid(light + at + pixels * c, plan->flat_light + pixels * c + at, 3.0f * noise[c], plan->saturated_above + pixels * c + at, width);
+            invalid |= any_invalid(light + at + pixels * c, plan->flat_light + pixels * c + at, 3.0f * plan->noise_std[c],
+                                   plan->saturated_above + pixels * c + at, width);
     }
-    if (invalid) solve_shadowed(plan, light, noise, depth, normal);
+    if (invalid) solve_shadowed(plan, light, depth, normal);
 }
 
-void find_normals(const Plan *plan, const float *light, const float *noise, const float *depth, float *normal) {
+void find_normals(const Plan *plan, const float *light, const float *depth, float *normal) {
     if (plan->by_lights)
-        by_lights(plan, light, noise, depth, normal);
+        by_lights(plan, light, depth, normal);
     else
         response_normals(plan, light, depth, normal);
 }

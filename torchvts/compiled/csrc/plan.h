@@ -8,7 +8,8 @@
 
 #define IMAGE_FIELDS(INTEGER, REAL, TABLE)                                                                                                    \
     INTEGER(height) INTEGER(width) REAL(mm_per_pixel)                                                                                         \
-    /* compensate.c; maps (3, height, width) or null; defect (defects), neighbours (defects, 4) */                                            \
+    /* compensate.c; light of the values k / (lights - 1), or null; maps (3, height, width) or null; defect (defects), neighbours (.., 4) */  \
+    TABLE(float, light_of) INTEGER(lights)                                                                                                    \
     TABLE(float, gain) TABLE(float, offset) TABLE(float, pedestal)                                                                            \
     TABLE(int64_t, defect) TABLE(int64_t, neighbours) INTEGER(defects) TABLE(float, blur) INTEGER(blur_taps)                                  \
     /* light.c; background (3, height, width), skin (3, samples), share (3, padded), place (3, 6, padded), terms (3, 6, 6), scales (steps),    \
@@ -22,7 +23,7 @@
     /* normals.c and shadowed.c; maps (3, height, width), inverse (3, 3, height, width), position (3, 3), albedo (3) */                       \
     INTEGER(by_lights) TABLE(float, inverse) TABLE(float, flat_light) TABLE(float, saturated_above) TABLE(uint8_t, ill_conditioned)           \
     INTEGER(any_ill_conditioned) TABLE(float, position) TABLE(float, albedo) REAL(per_camera_height) TABLE(float, noise_std)                  \
-    INTEGER(measures_noise) INTEGER(noise_stride) REAL(prior_std) REAL(brightness_noises) REAL(least_brightness) INTEGER(shadow_steps)        \
+    REAL(prior_std) REAL(brightness_noises) REAL(least_brightness) INTEGER(shadow_steps)        \
     REAL(cliff_slope) REAL(start_slope) REAL(left_out) REAL(failed_share)                                                                     \
     /* response.c; field_place (width), field (height, degree + 1, 2, terms), per_mm (height, 3, 3) or null */                                \
     TABLE(float, field_place) TABLE(float, field) INTEGER(degree) INTEGER(terms) TABLE(float, per_mm) REAL(steeper) REAL(reference_mm)        \
@@ -45,9 +46,8 @@
 #define SOLVE_FIELDS(INTEGER, REAL, TABLE)                                                                                                    \
     /* poisson.c */                                                                                                                           \
     TABLE(double, poisson) INTEGER(zeroed)                                                                                                    \
-    /* frame.c; coarse: of the model at every stride-th pixel, null where nothing is predicted */                                             \
-    INTEGER(passes) REAL(tolerance_px) TABLE(struct Plan, coarse) INTEGER(stride) REAL(threshold_px) INTEGER(shadows)                         \
-    INTEGER(slopes_of_depth)
+    /* frame.c */                                                                                                                             \
+    INTEGER(passes) INTEGER(slopes_of_depth)
 
 #define ALL_FIELDS(INTEGER, REAL, TABLE)   \
     IMAGE_FIELDS(INTEGER, REAL, TABLE)     \
@@ -63,14 +63,14 @@ typedef struct Plan {
     ALL_FIELDS(INTEGER_FIELD, REAL_FIELD, TABLE_FIELD)
 } Plan;
 
-/* Codes that stages return; of two, the larger one counts. */
-enum { DONE, NO_MEMORY, IN_PYTORCH };
+/* Codes that stages return. */
+enum { DONE, NO_MEMORY };
 
 /* The stages, each in the file of its name. All images are those of one frame. */
 int frame_light(const Plan *plan, const float *image, float *terms);                                            /* (3, 6), and lost (3) */
+void linearise(const Plan *plan, const float *image, float *light);                                             /* (3, H, W) to the same */
 int compensate(const Plan *plan, const float *image, float *terms, float *light);                               /* (3, H, W) to the same */
-int measure_noise(const Plan *plan, const float *light, float *noise);                                          /* (3) */
-void find_normals(const Plan *plan, const float *light, const float *noise, const float *depth, float *normal); /* depth or null */
+void find_normals(const Plan *plan, const float *light, const float *depth, float *normal);                     /* depth or null */
 void find_slopes(const float *normal, size_t pixels, double max_slope, float *gradient);                        /* (2, H, W) */
 int weigh(const Plan *plan, const float *light, const float *gradient, float *unseen, float *weight);           /* (1); (1, H, W) */
 int integrate(const Plan *plan, const float *gradient, float *depth);
@@ -82,8 +82,7 @@ int find_contact(const Plan *plan, const float *depth, const uint8_t *deformed, 
 float *sorted(float *values, float *other, int n);                                                    /* compensate.c */
 int blur_plane(const float *plane, const float *weight, int taps, int height, int width, float *out); /* compensate.c */
 void response_normals(const Plan *plan, const float *light, const float *depth, float *normal);       /* response.c */
-void solve_shadowed(const Plan *plan, const float *light, const float *noise, const float *depth, float *normal); /* shadowed.c */
-int any_blocked(const Plan *plan, const float *light, const float *noise, const float *weight);       /* shadowed.c */
+void solve_shadowed(const Plan *plan, const float *light, const float *depth, float *normal);         /* shadowed.c */
 void cell_means(const float *plane, int width, int cell, int rows, int columns, float *line, float *means);       /* weight.c */
 void to_pixels(const float *cells, int rows, int columns, int cell, int height, int width, float *some, float *image); /* weight.c */
 

@@ -66,28 +66,14 @@ static void slope_of_depth(const float *z, int y, int x, int height, int width, 
 }
 
 /* Channels whose LED has failed: dark in nearly all of the image. Returns whether any has. */
-static int failed_leds(const Plan *plan, const float *light, const float *noise, int failed[3]) {
+static int failed_leds(const Plan *plan, const float *light, int failed[3]) {
     const size_t pixels = (size_t)plan->height * plan->width;
     for (int j = 0; j < 3; j++) {
         size_t count = 0;
-        for (size_t k = 0; k < pixels; k++) count += is_dark(light[pixels * j + k], plan->flat_light[pixels * j + k], 3.0f * noise[j]);
+        for (size_t k = 0; k < pixels; k++) count += is_dark(light[pixels * j + k], plan->flat_light[pixels * j + k], 3.0f * plan->noise_std[j]);
         failed[j] = (float)count / (float)pixels > (float)plan->failed_share;
     }
     return failed[0] | failed[1] | failed[2];
-}
-
-/* Shadows: whether a light that has not failed is blocked where the skin has moved. */
-int any_blocked(const Plan *plan, const float *light, const float *noise, const float *weight) {
-    const size_t pixels = (size_t)plan->height * plan->width;
-    int failed[3], known = 0;
-    for (int j = 0; j < 3; j++)
-        for (size_t k = 0; k < pixels; k++)
-            if (weight[k] > 0.5f && is_dark(light[pixels * j + k], plan->flat_light[pixels * j + k], 3.0f * noise[j])) {
-                if (!known) failed_leds(plan, light, noise, failed), known = 1;
-                if (!failed[j]) return 1;
-                break;
-            }
-    return 0;
 }
 
 /* The light matrix at a pixel of depth z. */
@@ -102,7 +88,8 @@ static void lights_at(const Plan *plan, int y, int x, float z, float rows[3][3])
     }
 }
 
-static Model model_of(const Plan *plan, const float *noise) {
+static Model model_of(const Plan *plan) {
+    const float *noise = plan->noise_std;
     const float mean = (noise[0] * noise[0] + noise[1] * noise[1] + noise[2] * noise[2]) / 3.0f, std = fmaxf(sqrtf(mean), 1e-6f);
     const float weight = std / (float)plan->prior_std, trust = fmaxf((float)plan->brightness_noises * std, (float)plan->least_brightness) / std;
     return (Model){std, weight * weight, trust * trust, (float)plan->shadow_steps, (float)plan->mm_per_pixel, (float)plan->cliff_slope};
@@ -110,12 +97,12 @@ static Model model_of(const Plan *plan, const float *noise) {
 
 /* Replaces normals where a light that shines on the flat skin is dark, a channel is saturated, an LED has failed, or the matrix is ill-conditioned.
    With depth, a pixel starts from the slope of the depth; without, from its own normal, or from the flat skin. */
-void solve_shadowed(const Plan *plan, const float *light, const float *noise, const float *depth, float *normal) {
+void solve_shadowed(const Plan *plan, const float *light, const float *depth, float *normal) {
     const int height = (int)plan->height, width = (int)plan->width;
     const size_t pixels = (size_t)height * width;
-    const Model model = model_of(plan, noise);
+    const Model model = model_of(plan);
     int failed[3];
-    const int any_failed = failed_leds(plan, light, noise, failed);
+    const int any_failed = failed_leds(plan, light, failed);
     for (int y = 0; y < height; y++)
         for (int x = 0; x < width; x++) {
             const size_t at = (size_t)y * width + x;
@@ -124,7 +111,7 @@ void solve_shadowed(const Plan *plan, const float *light, const float *noise, co
             for (int j = 0; j < 3; j++) {
                 const float value = light[pixels * j + at];
                 const int is_saturated = value >= plan->saturated_above[pixels * j + at];
-                wanted |= is_saturated || is_dark(value, plan->flat_light[pixels * j + at], 3.0f * noise[j]);
+                wanted |= is_saturated || is_dark(value, plan->flat_light[pixels * j + at], 3.0f * plan->noise_std[j]);
                 saturated[j] = is_saturated || failed[j] || value <= 0.5f * (float)plan->left_out;
                 intensity[j] = failed[j] ? 0.0f : value;
             }

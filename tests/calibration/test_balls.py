@@ -10,8 +10,8 @@ from test_presses import BALL_MM, CENTERS_MM, GIVEN, HEIGHT, PITCH, WIDTH, backg
 
 import torchvts as vts
 from torchvts.calibration import closure
-from torchvts.calibration.by_presses import by_presses, with_preprocessing
 from torchvts.calibration.contacts import read_contacts
+from torchvts.calibration.press_model import by_presses, with_preprocessing
 
 PREPARED = with_preprocessing(GIVEN, None)
 

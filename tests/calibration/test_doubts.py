@@ -9,9 +9,9 @@ import torch
 
 import torchvts as vts
 from lab.drawn_sensors import drawn_sensor
-from torchvts.calibration.by_presses import by_presses
 from torchvts.calibration.contacts import used
 from torchvts.calibration.doubts import of_sizes, width_of
+from torchvts.calibration.press_model import by_presses
 from torchvts.calibration.resting import beside_presses
 from torchvts.stream.background import with_background
 

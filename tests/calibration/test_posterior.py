@@ -11,10 +11,10 @@ from test_presses import BALL_MM, CENTERS_MM, DEPTHS_MM, GIVEN, PITCH, backgroun
 
 import torchvts as vts
 from lab import score
-from torchvts.calibration.by_presses import with_preprocessing
 from torchvts.calibration.contacts import read_contacts
 from torchvts.calibration.field import TRANSITION_REACH, TRANSITION_WEIGHT, Family, ball_sine, power_of
 from torchvts.calibration.posterior import ALL_SENSORS, Evidence, largest, prior_of
+from torchvts.calibration.press_model import with_preprocessing
 from torchvts.model.response_field import ResponseField, ResponseModel, SensorPrior
 from torchvts.model.stated_error import variance_of
 

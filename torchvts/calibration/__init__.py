@@ -1,13 +1,13 @@
 """Offline calibration: from images of a unit to its Calibration."""
 
 from .by_lights import GIVEN_MISFIT
-from .by_presses import RESPONSE_BLUR_PX, by_presses, with_preprocessing
-from .calibrate import calibrate
 from .contacts import ROUGH, channel_structure
 from .doubts import CalibrationWarning
 from .lights import POORLY_CONSTRAINED_DEG, LightFit, fit_lights
+from .press_model import RESPONSE_BLUR_PX, by_presses, with_preprocessing
 from .presses import Press, read_presses
 from .prior import PriorUnit, fit_prior, score_prior
+from .unit import calibrate
 
 __all__ = [
     "GIVEN_MISFIT",

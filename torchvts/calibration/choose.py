@@ -12,12 +12,12 @@ from ..model.response_field import SensorPrior
 from ..model.sensor import Sensor
 from . import resting
 from .by_lights import by_lights
-from .by_presses import by_presses
 from .contacts import Contact, NoUsablePress, used
 from .doubts import SURE, Doubt, not_checked, of_fitted_lights, of_presses, of_sizes, of_type, too_wide, width_of
 from .field import Family
 from .given_images import colourless
 from .posterior import Evidence, prior_of
+from .press_model import by_presses
 from .presses import Press
 from .touching import with_contact
 

@@ -20,7 +20,7 @@ REACH = 1.5
 STEP = 0.7
 """Part of the predicted error that is taken away at once. On drawn sensors errors are 0.6 to 1.0 of what is predicted."""
 
-ROUNDS = 3
+CLOSURE_ROUNDS = 3
 
 LEFT = 0.75
 """Net slope that may be left after the shift, as a part of that before, in the mean over the two largest families. A drift of the
@@ -58,7 +58,7 @@ def close_loops(contacts: list[Contact], half_mm: float) -> None:
     if float(found.errors_mm.isnan().any(1).double().mean()) > MOST_CUT:
         return
     for common in (True, False):
-        for _ in range(ROUNDS):
+        for _ in range(CLOSURE_ROUNDS):
             moved = _Rating(found.family, _moved(found.contacts, found.errors_mm, common))
             if moved.score() >= found.score():
                 break

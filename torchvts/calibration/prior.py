@@ -12,23 +12,23 @@ from ..core.checks import check_image, check_record, check_sequence
 from ..model.calibration import Calibration
 from ..model.response_field import ResponseField, ResponseModel, SensorPrior, fit_log_background
 from ..model.sensor import Sensor, check_sensor
-from .by_presses import by_presses
 from .contacts import Contact, used
 from .doubts import CalibrationWarning
 from .field import Family, power_of
 from .given_images import sort_presses
 from .posterior import Evidence, Prior, mean_error_deg
+from .press_model import by_presses
 from .presses import Press, check_presses
 from .response_fit import FEW, fit_depth_brightness
 
-DEGREES = (2, 1)
+PRIOR_DEGREES = (2, 1)
 """Degrees of a type's field in position, of linear terms and of products of two. Of two pairs of units, each by the other, without
 products, and in the largest family, it is 1 and 2 % worse."""
 
 RIDGE = 0.0005
 """Prior precision of a constant linear term, in units: of each unit by the other, 0.0001 to 0.002 are as good within 2 %."""
 
-PARTS = 4
+PRIOR_PARTS = 4
 """Presses of one ball are held out in so many parts."""
 
 
@@ -100,7 +100,7 @@ def _fitted(unit: PriorUnit) -> tuple[Calibration, list[Contact]]:
 
 def _pooled(balls: Sequence[Sequence[Contact]], half_mm: float) -> ResponseField:
     """The field of several units, each of which counts alike."""
-    family = Family(*DEGREES, half_mm)
+    family = Family(*PRIOR_DEGREES, half_mm)
     evidence = Evidence(family, [contact for own in balls for contact in own])
     weights = torch.tensor([1.0 / len(own) / len(balls) for own in balls for _ in own], dtype=torch.float64)
     power = sum(power_of(own) for own in balls) / len(balls)
@@ -157,7 +157,7 @@ def _held_out_by_groups(contacts: Sequence[Contact], half_mm: float) -> tuple[fl
     sizes = sorted({contact.radius_mm for contact in contacts})
     groups = [[contact for contact in contacts if contact.radius_mm == size] for size in sizes]
     if len(groups) < 2 or min(map(len, groups)) < FEW:
-        groups = [list(contacts[k::PARTS]) for k in range(PARTS)]
+        groups = [list(contacts[k::PRIOR_PARTS]) for k in range(PRIOR_PARTS)]
     if len(contacts) < 2 * FEW:
         return ()
     total = 0.0

@@ -23,13 +23,13 @@ are given as the background."""
 LEAST_STRUCTURE = 0.01
 """Smallest such excess: less is noise. A press has 0.02 to 0.7."""
 
-CELLS = 60
+RESTING_CELLS = 60
 """Cells along the shorter side, on which structure and smooth light are found."""
 
 DEGREE = 4
 """Degree in position of the logarithm of smooth light: that of a prior's pattern."""
 
-ROUNDS = 20
+RESTING_ROUNDS = 20
 """Rounds of reweighting: a contact over a tenth of the skin is left out after ten."""
 
 LEAST_MM = 0.1
@@ -95,7 +95,7 @@ def _smooth(unit: Calibration) -> Tensor:
     half_mm = 0.5 * width * pitch_mm
     basis = position_basis(*_grid(log.shape[1], log.shape[2], cell * pitch_mm), half_mm, DEGREE).flatten(1).t()
     values, weight = log.flatten(1).t(), torch.ones(basis.shape[0], 1, dtype=torch.float64)
-    for _ in range(ROUNDS):
+    for _ in range(RESTING_ROUNDS):
         solution = torch.linalg.solve(basis.t() @ (weight * basis), basis.t() @ (weight * values))
         left = values - basis @ solution
         scale = left.abs().median(dim=0).values / 0.6745 + 1e-3
@@ -111,7 +111,7 @@ def _grid(height: int, width: int, pitch_mm: float) -> tuple[Tensor, Tensor]:
 
 
 def _cell(image: Tensor) -> int:
-    return max(1, min(image.shape[1:]) // CELLS)
+    return max(1, min(image.shape[1:]) // RESTING_CELLS)
 
 
 def _margin(structure: Tensor) -> int:

@@ -9,16 +9,16 @@ from ..core.checks import check_field, check_positive, check_same_size, check_sh
 from ..core.precision import widened
 from ..model.calibration import PEDESTAL, Calibration, check_calibration
 
-SAMPLES = 24
+LIGHT_SAMPLES = 24
 """Samples along the shorter side from which the light is found; of smaller images it is taken to be the background's."""
 
-EVERY = 3
+LIGHT_EVERY = 3
 """Every so many rows and columns of the samples, one is a candidate for undeformed skin."""
 
 ALIKE = 0.03
 """Scale of relative differences of light between samples that are undeformed skin, when candidates are compared."""
 
-BETTER = 1.1
+LIGHT_BETTER = 1.1
 """A surface must have this many times the support of the background's own light: it has parameters to spend."""
 
 EXACT = 0.002
@@ -27,7 +27,7 @@ EXACT = 0.002
 DAMPING = 0.02
 """Least share of the samples that decides how far a step of the fit goes in any direction."""
 
-STEPS = 12
+LIGHT_STEPS = 12
 """Steps of the fit of the surface."""
 
 FIRST_SCALE, LAST_SCALE = 0.06, 0.014
@@ -44,7 +44,7 @@ BLACK = 2.0 / 255.0
 LEAST_LIGHT = 0.05
 """Least light, over the background's, that is divided by: where a surface is extrapolated it may be anything."""
 
-LOST = 0.9
+MOST_LOST = 0.9
 """Share of the samples of a channel that may be black or saturated: with more, it gets the light of the others."""
 
 
@@ -110,10 +110,10 @@ class Relight(nn.Module):
         self.saturation_light = check_positive("saturation_light", saturation_light)
         self.black = BLACK ** check_positive("exponent", exponent)
         self.size = (background.shape[1], background.shape[2])
-        self.stride, self.shows = max(1, min(self.size) // SAMPLES), min(self.size) >= SAMPLES
+        self.stride, self.shows = max(1, min(self.size) // LIGHT_SAMPLES), min(self.size) >= LIGHT_SAMPLES
         self.least = LEAST_LIGHT
-        self.every, self.alike, self.damping, self.better, self.most_lost = EVERY, ALIKE, DAMPING, BETTER, LOST
-        self.scales = [FIRST_SCALE * (LAST_SCALE / FIRST_SCALE) ** min(1.0, 2.0 * k / STEPS) for k in range(STEPS)]
+        self.every, self.alike, self.damping, self.better, self.most_lost = LIGHT_EVERY, ALIKE, DAMPING, LIGHT_BETTER, MOST_LOST
+        self.scales = [FIRST_SCALE * (LAST_SCALE / FIRST_SCALE) ** min(1.0, 2.0 * k / LIGHT_STEPS) for k in range(LIGHT_STEPS)]
         self.register_buffer("background", background.detach().clone())
         light = background.detach().double()
         sampled, brightest = grid_samples(light[None], self.stride)

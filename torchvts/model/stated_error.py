@@ -24,7 +24,7 @@ off."""
 NOT_METRIC_DEG = 20.0
 """Mean error of a field whose scale is in doubt, degrees: no better than to call every ball flat."""
 
-CELLS = 60
+ERROR_CELLS = 60
 """Cells along the shorter side of the image on which the error is stated."""
 
 PRESSED_SINE = 0.25
@@ -93,7 +93,7 @@ class StatedError(nn.Module):
         self.own_deg = check_positive("own_deg", own_deg)
         check_record("field", field, ResponseField, "a calibration by a response field has one")
         self.states = covariance is not None
-        self.cell = max(1, min(height, width) // CELLS)
+        self.cell = max(1, min(height, width) // ERROR_CELLS)
         self.scale = CHANGE_SCALE
         terms = field.terms()
         first, second = torch.triu_indices(len(terms), len(terms))

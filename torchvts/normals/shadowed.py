@@ -17,7 +17,7 @@ half of it."""
 PRIOR_STD = 0.25
 """Spread of slopes about what is known of them beforehand."""
 
-STEPS = 3
+SLOPE_STEPS = 3
 """Gauss-Newton steps where a light is blocked."""
 
 BRIGHTNESS_NOISES = 1.5
@@ -59,7 +59,7 @@ def matrix_in_view(depth_mm: Tensor, view: LightView) -> Tensor:
     return light_matrix(depth_mm, view.position_mm, view.albedo, view.mm_per_pixel, view.camera_height_mm)
 
 
-class Pixels(NamedTuple):
+class DarkPixels(NamedTuple):
     """N pixels to solve by themselves.
 
     Attributes:
@@ -81,7 +81,7 @@ class Pixels(NamedTuple):
     gloss: Tensor | None = None
 
 
-def slope_by_lit_lights(pixels: Pixels, prior_std: float = PRIOR_STD, steps: int = STEPS) -> Tensor:
+def slope_by_lit_lights(pixels: DarkPixels, prior_std: float = PRIOR_STD, steps: int = SLOPE_STEPS) -> Tensor:
     """Slopes of pixels where a light is blocked or a channel is saturated: each pixel against the clamped model max(0, L n).
 
     On a glossy skin the lobe is part of the model: two lights leave a direction in which the slope answers to small differences of
@@ -247,7 +247,9 @@ class ShadowedPixels(nn.Module):
         intensity, lost = image[b, :, row, column], failed[b]
         saturated = (intensity >= self.saturated_above[:, row, column].t()) | lost | (intensity <= 0.5 * self.left_out)
         std = self.of_all_channels().expand(len(start))
-        pixels = Pixels(start, intensity * (~lost).to(intensity.dtype), rows, saturated, std, self.brightness_std(std), view.gloss)
+        pixels = DarkPixels(
+            start, intensity * (~lost).to(intensity.dtype), rows, saturated, std, self.brightness_std(std), view.gloss
+        )
         slope = slope_by_lit_lights(pixels)
         solution = normal_from_gradient(slope[:, :, None, None])[:, :, 0, 0]
         solution = torch.where(wanted[b, row, column][:, None], solution, normal[b, :, row, column])

@@ -12,7 +12,7 @@ from .depth import DepthPipeline
 MOST = 3.0
 """Change of a channel's light, as a factor, that automatic exposure and white balance make at most."""
 
-LOST = 0.5
+LOST_SHARE = 0.5
 """Share of a channel that is black or saturated from which it is said."""
 
 
@@ -45,7 +45,7 @@ def doubts_of(conditions: Conditions, usual_deg: float) -> list[str]:
         parts = [
             f"channel {name} is black or saturated in {float(share):.0%} of the skin"
             for name, share in zip("RGB", lost)
-            if float(share) > LOST
+            if float(share) > LOST_SHARE
         ]
         parts += [
             f"channel {name} has {float(one):.0%} of its light" for name, one in zip("RGB", level) if not 1.0 / MOST < one < MOST

@@ -34,7 +34,7 @@ from ..model.response_field import CHANGE_SCALE, MAX_SLOPE
 from ..model.stated_error import StatedError
 from ..normals import NormalFromIntensity, NormalFromResponse, as_normal_model
 from ..skin import ContactSettings, unseen_deg
-from ..skin.weight import CELLS, LEAST_SPREAD, RISE
+from ..skin.weight import LEAST_SLOPE_SPREAD, WEIGHT_CELLS, WEIGHT_RISE
 from .depth import DepthOutput, DepthPipeline, eval_around
 
 FACTORS = ("noise", "spread", "model", "surface")
@@ -225,13 +225,13 @@ class Confidence(nn.Module):
         self.weights = gaussian_weights(min(edge_px, MOST_BLUR_PX))
         self.reach = math.ceil(edge_px)
         self.correlation = max(1.0, 2.0 * math.sqrt(math.pi) * blur_px)  # blurred noise is as much larger in the sums
-        cell = max(1, min(noise_std.shape[1:]) // CELLS)
+        cell = max(1, min(noise_std.shape[1:]) // WEIGHT_CELLS)
         self.cell_share = min(1.0, (self.correlation / cell) ** 2)  # of the variance of noise that means over cells have
         # TorchScript sees no numbers of the module
         self.spread = 1.0 if self.by_lights else RESPONSE_SPREAD
         self.quantile = quantile_95(presses)
         self.clipped_variance, self.per_mean = math.radians(CLIPPED_DEG) ** 2, math.radians(1.0) / SPREAD_OF_MEAN
-        self.cells, self.sure, self.least_spread, self.faint_deg = CELLS, RISE[1], LEAST_SPREAD, UNSEEN_DEG
+        self.cells, self.sure, self.least_spread, self.faint_deg = WEIGHT_CELLS, WEIGHT_RISE[1], LEAST_SLOPE_SPREAD, UNSEEN_DEG
         self.useful_deg, self.around, self.steepest = USEFUL_DEG, AROUND, math.atan(MAX_SLOPE)
         self.missed_mm = 0.5 * MISSED * min(noise_std.shape[1:]) * mm_per_pixel
         self.black, self.saturated = BLACK, SATURATED

@@ -28,7 +28,7 @@ SHARE = 0.3
 LARGE = 0.9
 """The frame's pressure is this quantile of the deep skin's: rims of flat faces bear more than the faces."""
 
-DEEP = 0.15
+DEEP_SHARE = 0.15
 """Depth of the deep skin, as a share of the deepest."""
 
 LEAST_DEEP = 0.005
@@ -50,13 +50,13 @@ PULLING = 0.5
 KINK = 2.0
 """A kink at the rim of an object without skin has L^2 of this number times that of the blur: depth is blurred as much again."""
 
-STEPS = 64
+PULL_STEPS = 64
 """L^2 of a frame is found in so many steps."""
 
 LEAST_CONTACT_DEPTH = 0.02
 """Contact is deeper than this share of the largest depth."""
 
-SAMPLES = 120
+CONTACT_SAMPLES = 120
 """Samples of the frame's pressure along the shorter side."""
 
 
@@ -90,11 +90,11 @@ class ContactFromDepth(nn.Module):
         self.mm_per_pixel = check_positive("mm_per_pixel", mm_per_pixel)
         self.share = SHARE if share is None else check_positive("share", share, 1.0)
         self.cell = max(1, round(CELL_MM / mm_per_pixel))
-        self.large, self.deep, self.rim_mm, self.fall = LARGE, DEEP, RIM_MM, FALL
+        self.large, self.deep, self.rim_mm, self.fall = LARGE, DEEP_SHARE, RIM_MM, FALL
         self.by_frame = decay_mm is None
         self.decay_mm = CONTACT_DECAY_MM if decay_mm is None else check_decay("decay_mm", decay_mm)
         self.blur_mm, self.least_deep = BLUR_MM, LEAST_DEEP
-        self.pull, self.pulling, self.kink, self.steps, self.least_depth = PULL, PULLING, KINK, STEPS, LEAST_CONTACT_DEPTH
+        self.pull, self.pulling, self.kink, self.steps, self.least_depth = PULL, PULLING, KINK, PULL_STEPS, LEAST_CONTACT_DEPTH
 
     @classmethod
     def from_calibration(cls, calibration: Calibration, settings: ContactSettings | None = None) -> "ContactFromDepth":
@@ -166,7 +166,7 @@ def rim_reach(rim_mm: float, pitch_mm: float) -> int:
     return max(1, int(rim_mm / pitch_mm + 0.5))
 
 
-def frame_quantile(values: Tensor, weights: Tensor, share: float, samples: int = SAMPLES) -> Tensor:
+def frame_quantile(values: Tensor, weights: Tensor, share: float, samples: int = CONTACT_SAMPLES) -> Tensor:
     """A quantile of the weighed values of each frame (B, 1, h, w), (B, 1, 1, 1); 0 where nothing weighs."""
     step = max(1, min(values.shape[2], values.shape[3]) // samples)
     weights = weights[:, :, step // 2 :: step, step // 2 :: step].flatten(1)

@@ -13,14 +13,14 @@ from ..model.calibration import Calibration, check_calibration
 from ..model.lights import PointLights
 from .settings import ContactSettings
 
-CELLS = 60
+WEIGHT_CELLS = 60
 """Cells along the shorter side of the image. With 40, relief of drawn sensors is 3 % worse; with 80, 2 % better, and
 JPEG of free skin shows contact."""
 
-RISE = (1.2, 3.0)
+WEIGHT_RISE = (1.2, 3.0)
 """Evidence at which the weight leaves 0 and reaches 1. From 0.8 and 2.5 on relief is 1 % worse, all else equal."""
 
-LEAST_SPREAD = 0.002
+LEAST_SLOPE_SPREAD = 0.002
 """Least spread of slopes and of relative changes of light: half a count of 8 bits."""
 
 WITHIN = 2.5
@@ -49,7 +49,7 @@ FAILED = 0.05
 LEAST_DEPTH = 0.01
 """Depth of moved skin, as a share of the deepest, at least."""
 
-DARK = 0.05
+FAILED_LIGHT = 0.05
 """Light of a channel, as a share of its median, below which its relative change counts as if it were that bright."""
 
 
@@ -90,8 +90,8 @@ class ContactMask(nn.Module):
     ) -> None:
         super().__init__()
         self.sigmas, self.by_colour = check_least("sigmas", sigmas, 1.0, 1000.0), check_switch("by_colour", by_colour)
-        self.cells, self.rise, self.grey_share, self.failed = CELLS, RISE, GREY_SHARE, FAILED
-        self.weights, self.least_spread = gaussian_weights(BLUR_CELLS), LEAST_SPREAD
+        self.cells, self.rise, self.grey_share, self.failed = WEIGHT_CELLS, WEIGHT_RISE, GREY_SHARE, FAILED
+        self.weights, self.least_spread = gaussian_weights(BLUR_CELLS), LEAST_SLOPE_SPREAD
         flat = torch.ones(3, 1, 1) if flat is None else flat
         check_field("flat", flat)
         self.register_buffer("flat", flat.detach().clone())
@@ -99,7 +99,7 @@ class ContactMask(nn.Module):
         check_field("light", light)
         check_same_size("light", light, "flat", flat.shape[1], flat.shape[2])
         typical = light.detach().flatten(1).median(dim=1).values[:, None, None]
-        self.register_buffer("per_light", 1.0 / light.detach().maximum(DARK * typical).clamp_min(1e-6))
+        self.register_buffer("per_light", 1.0 / light.detach().maximum(FAILED_LIGHT * typical).clamp_min(1e-6))
         per_noise = torch.ones_like(flat[:1])
         if noise_std is not None:
             check_field("noise_std", noise_std)
@@ -174,7 +174,7 @@ def colour_of_slopes(lights: PointLights) -> float:
     return float(colour.amin() / change.norm(dim=1).amax())
 
 
-def length_in_spreads(means: Tensor, beside: Tensor, least: float = LEAST_SPREAD) -> Tensor:
+def length_in_spreads(means: Tensor, beside: Tensor, least: float = LEAST_SLOPE_SPREAD) -> Tensor:
     """Length (B, 1, h, w) of vectors (B, C, h, w), each component in units of its spread in the frame's least changed cells.
 
     Root mean square over the two dimensions that slopes have, and changes of colour (three components of zero sum). ``beside``:
@@ -201,7 +201,9 @@ def spread_of(
     return spread.gather(2, end)
 
 
-def unseen_deg(gradient: Tensor, cells: int = CELLS, sure: float = RISE[1], least: float = LEAST_SPREAD) -> Tensor:
+def unseen_deg(
+    gradient: Tensor, cells: int = WEIGHT_CELLS, sure: float = WEIGHT_RISE[1], least: float = LEAST_SLOPE_SPREAD
+) -> Tensor:
     """Slope below which moved skin is not surely told from undeformed skin, degrees, (B,).
 
     Args:

@@ -10,7 +10,7 @@ from ..core.checks import check_batch, check_positive
 from ..core.geometry import laplacian
 from ..core.precision import widened
 
-CELLS = 30
+ZERO_CELLS = 30
 """Cells along the shorter side of the image, on which the offset is fitted."""
 
 WAVES = 8
@@ -63,7 +63,7 @@ class ZeroBackground(nn.Module):
     def __init__(self, mm_per_pixel: float) -> None:
         super().__init__()
         self.mm_per_pixel = check_positive("mm_per_pixel", mm_per_pixel)
-        self.cells, self.waves, self.scales = CELLS, WAVES, list(SCALES)
+        self.cells, self.waves, self.scales = ZERO_CELLS, WAVES, list(SCALES)
         self.decay_mm, self.smooth_mm, self.stiff = DECAY_MM, SMOOTH_MM, STIFF
         self.pit, self.pit_share = PIT, PIT_SHARE
 

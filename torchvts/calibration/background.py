@@ -15,8 +15,7 @@ from ..model.lights import PointLights, log_slope_of_lobe, microfacet
 from ..model.sensor import Sensor
 
 FURTHEST = 30.0
-"""Most distant light, in half-widths of the image. The fall-off of one further away curves by less than 0.2 % over the image,
-which no lens is flat to; a background that is no paraboloid at all sends its light there."""
+"""Most distant light, in half-widths of the image."""
 
 
 class BackgroundPixels(NamedTuple):

@@ -18,9 +18,7 @@ from .field import ContactForms, Family, solve_with_centers
 from .regions import one_ball, strong_blobs
 
 EDGE_SLOPE_RATIO = 0.6
-"""The contact ends where the skin's slope has fallen to this part of the ball's: about the middle of the fall. On drawn sensors
-that is 1.07 to 1.10 of the exact radius; where light saturates or shadows hold the slope down, it is less (0.9 of the labels of a
-pale GelSight)."""
+"""The contact ends where the skin's slope has fallen to this part of the ball's: about the middle of the fall."""
 
 WIDEST = 0.95
 """Largest contact radius that is searched, in radii of the ball: at 0.95 its slope is 3."""

@@ -18,8 +18,7 @@ GIVEN_MISFIT = 0.2
 """RMS of log(background / image of the sensor file's lights) from which they are not the unit's: only their directions are used."""
 
 NOTHING_LEFT = 0.005
-"""Misfit from which another gamma is tried where the sensor file leaves it open, and from which depth is not metric: it is at most
-0.002 of lights as the model has them, 0.007 with 5 % less light in the corners, where depth is 12 % off."""
+"""Misfit from which another gamma is tried where the sensor file leaves it open, and from which depth is not metric."""
 
 WELL_CONSTRAINED_DEG = 2.0
 MOST_MISFIT = 0.02

@@ -23,9 +23,7 @@ STEP = 0.7
 CLOSURE_ROUNDS = 3
 
 LEFT = 0.75
-"""Net slope that may be left after the shift, as a part of that before, in the mean over the two largest families. A drift of the
-centers explains it, so it goes with them: 0.51 to 0.70 is left on drawn sensors, whose centers come twice as near to the truth.
-Light that a press changes around it does not: 0.83 to 0.94 on a DIGIT and two GelSight Minis, where a shift does harm."""
+"""Net slope that may be left after the shift, as a part of that before, in the mean over the two largest families."""
 
 ENOUGH = 3
 """Presses from which centers can be scored by holding presses out."""

@@ -43,8 +43,7 @@ LIGHT_DRIFT = 0.008
 """Least noise by which a press differs from the background, relative to it: the LEDs of real sensors drift by 1 to 2 %."""
 
 OTHER_SKIN = 0.1
-"""Change of the least changed skin, relative, from which an image is that of another unit: presses of five real sensors
-change it by at most 6 %."""
+"""Change of the least changed skin, relative, from which an image is that of another unit."""
 
 MAX_SAMPLES = 2000
 """Pixels of a press that enter the fit. More add little, because neighbours are alike."""

@@ -24,8 +24,7 @@ SURE = 2.5
 """Standard deviations from which a doubt is raised: one in 80 of right sets, if they are Gaussian."""
 
 UNIT_GAIN = 0.15
-"""Standard deviation of the logarithm of a unit's slopes by the prior of its type over the true ones: 0.87 to 1 on three GelSight
-Minis, 0.7 to 1 by priors of one unit."""
+"""Standard deviation of the logarithm of a unit's slopes by the prior of its type over the true ones."""
 
 PRESS_GAIN = 0.1
 """The same of one press over the unit's: of single presses of two Minis and two DIGITs, 7 in 200 are beyond a factor of 1.42."""
@@ -44,13 +43,11 @@ RIM_SINE = 0.7
 """Part of a ball's sine that is left at the rim of its contact: about the middle of its fall."""
 
 UNSEEN = 0.5
-"""A direction of slopes of which a field finds less than this part of what it finds of the other is not seen: it is 0.86 to 1 on
-twelve real sets and eight drawn sensors, 0.3 and 0.4 with LEDs on one line."""
+"""A direction of slopes of which a field finds less than this part of what it finds of the other is not seen."""
 
 SAME_TYPE = 0.27
-"""Median difference of a background from the prior's pattern, logarithm of the light, up to which a unit is of the prior's type: it
-is 0.03 to 0.08 on three GelSight Minis and 0.06 and 0.26 on two DIGITs, at most 0.24 with the frame shifted by 8 %, and at least
-0.30 on 18 sensors of other types."""
+"""Median difference of a background from the prior's pattern, logarithm of the light, up to which a unit is of the prior's
+type."""
 
 SHIFTED = 0.15
 """The same, from which a frame is cropped otherwise, not only shifted as units are: whole frames of a GelSight Mini have 0.17."""

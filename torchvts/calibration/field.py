@@ -27,8 +27,7 @@ from ..model.response_field import (
 from .contacts import Contact
 
 TRANSITION_WEIGHT = 0.3
-"""Weight of the transition zone around a contact. Without it depth of a GelSight Mini is tilted more (relief 24.7 -> 26.0 um), and
-centers on digit_a, whose contacts hold shadows, move by 3 px."""
+"""Weight of the transition zone around a contact."""
 TRANSITION_REACH = 2.0
 """The transition zone between ball and undeformed skin ends at this many contact radii."""
 LEAST_ZONE = 10

@@ -14,19 +14,17 @@ from .contacts import DARK, MOST_SATURATED
 from .presses import Press
 
 UNIFORM_COLOUR = 0.05
-"""Variation of a background's colour, RMS of the differences of log R, G and B, below which no coloured lights are seen. It is
-0.018 under the white light of a 9DTact and 0.16 to 0.56 on six sensors with coloured lights."""
+"""Variation of a background's colour, RMS of the differences of log R, G and B, below which no coloured lights are seen."""
 
 ACHROMATIC = 0.25
-"""Share of a contact's change of light that is a change of colour, below which the lights have no colours. It is 0.07 for the ball
-on the 9DTact, and 1.0 to 1.7 on five sensors with coloured lights."""
+"""Share of a contact's change of light that is a change of colour, below which the lights have no colours."""
 
 FAINT = 0.03
 """Change of the logarithm of the light from which a contact is seen at all."""
 
 OTHER_UNIT = 0.12
-"""Difference from the background, median over the skin and over the presses, logarithm of the image value, from which presses are
-of another unit, light or crop. It is at most 0.08 on 14 units, and 0.15 to 0.85 between units of different types."""
+"""Difference from the background, median over the skin and over the presses, logarithm of the image value, from which presses
+are of another unit, light or crop."""
 
 
 def check_exposure(background: Tensor) -> None:

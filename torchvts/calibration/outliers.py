@@ -19,8 +19,7 @@ PRIOR_PRESSES = 0.3
 """A prior counts as so many presses when a press is compared with the prior as the others change it, where they cover its place."""
 
 FAR_FROM_PRIOR = 1.42
-"""By that a diameter is wrong where the ball seems so many times as wide or as narrow as given. On two GelSight Minis and two
-DIGITs, each by the prior of the other unit, 3 of 200 sets of correct presses hold such a one; by the prior alone 7."""
+"""By a prior a diameter is wrong where the ball seems so many times as wide or as narrow as given."""
 
 NOISE = 0.1
 """Standard deviation of the gain of a press by the field of others that cover its place."""

@@ -33,8 +33,7 @@ LARGEST = (4, 3, 1)
 """Degrees in position of linear terms, products of two, and of three."""
 
 ALL_SENSORS = 0.015
-"""Prior precision of a constant linear term over all sensors, in presses. From 0.01 to 0.02 errors on presses that were not learned
-change by 1 %, on 18 sensors."""
+"""Prior precision of a constant linear term over all sensors, in presses."""
 
 
 class Prior(NamedTuple):

@@ -14,7 +14,7 @@ from .presses import Press
 from .response_fit import FEW, fit_response
 
 RESPONSE_BLUR_PX = 1.0
-"""Blur of a response field at 320 x 240: it reduces the error of normals on a GelSight Mini by a third; more blur gains nothing."""
+"""Blur of a response field at 320 x 240, pixels."""
 
 
 def by_presses(

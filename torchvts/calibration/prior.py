@@ -22,8 +22,7 @@ from .presses import Press, check_presses
 from .response_fit import FEW, fit_depth_brightness
 
 PRIOR_DEGREES = (2, 1)
-"""Degrees of a type's field in position, of linear terms and of products of two. Of two pairs of units, each by the other, without
-products, and in the largest family, it is 1 and 2 % worse."""
+"""Degrees of a type's field in position, of linear terms and of products of two."""
 
 RIDGE = 0.0005
 """Prior precision of a constant linear term, in units: of each unit by the other, 0.0001 to 0.002 are as good within 2 %."""

@@ -16,9 +16,8 @@ from .presses import Press
 from .touching import depth_of
 
 CONTACT = 0.2
-"""A background holds a contact if its structure exceeds that of the presses, in a place, by this part of what theirs exceeds its
-own. The part is at most 0.1 on 10 of 11 real units, 0.03 on eight drawn ones, and above 0.2 for 98 in 100 presses of theirs that
-are given as the background."""
+"""A background holds a contact if its structure exceeds that of the presses, in a place, by this part of what theirs exceeds
+its own."""
 
 LEAST_STRUCTURE = 0.01
 """Smallest such excess: less is noise. A press has 0.02 to 0.7."""
@@ -33,8 +32,7 @@ RESTING_ROUNDS = 20
 """Rounds of reweighting: a contact over a tenth of the skin is left out after ten."""
 
 LEAST_MM = 0.1
-"""Depth that a background may read beside its own smooth light: at most 0.05 mm on four units by the priors of their types, and
-above 0.3 mm for 25 in 26 presses of theirs."""
+"""Depth that a background may read beside its own smooth light, mm."""
 
 
 def beside_presses(background: Tensor, presses: Sequence[Press]) -> str:

@@ -35,8 +35,7 @@ FIRST_SCALE, LAST_SCALE = 0.06, 0.014
 most down to the noise of real frames. Samples off by twice that, in each channel, do not count."""
 
 UNEVEN = 0.06
-"""Unevenness of the light's change that presses make at most: 0.054 on eleven real and eight drawn sensors, 0.024 in the median
-over the presses of each, and 0.03 to 0.2 where the background has another gamma or saturation."""
+"""Unevenness of the light's change that presses make at most."""
 
 BLACK = 2.0 / 255.0
 """Image value up to which a sample is black: it says nothing of the light."""

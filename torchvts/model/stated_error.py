@@ -18,8 +18,7 @@ BESIDE_DEG = 1.5
 """Error that is there whatever the presses say, degrees: found centers, skin that hangs off the ball."""
 
 UNKNOWN_DEG = 5.0
-"""Mean error of a field without a covariance, degrees: one that was given, or a file that does not say. Priors are 2 to 5 degrees
-off."""
+"""Mean error of a field without a covariance, degrees: one that was given, or a file that does not say."""
 
 NOT_METRIC_DEG = 20.0
 """Mean error of a field whose scale is in doubt, degrees: no better than to call every ball flat."""

@@ -21,9 +21,7 @@ SLOPE_STEPS = 3
 """Gauss-Newton steps where a light is blocked."""
 
 BRIGHTNESS_NOISES = 1.5
-"""Standard deviation of the common brightness, in units of noise, where a light is blocked. At a noise of 0.01 a ball keeps a
-fifth of the plain inverse's error, and a quarter if the brightness counts in full; with 2 % at any noise, walls of slope 4 at a
-noise of 0.002 are twice as wrong."""
+"""Standard deviation of the common brightness, in units of noise, where a light is blocked."""
 
 LEAST_BRIGHTNESS = 0.005
 """It is so large at least."""

@@ -12,8 +12,7 @@ LEAST_SLOPE = 0.02
 """RMS of the slopes of a frame that says something of their axes."""
 
 CONTRADICTED = 0.3
-"""Share of the slopes' energy that no surface has, from which their axes are asked about: it is 0.01 of balls, 0.5 of balls
-with an axis turned over or both swapped, 1 with both, and 0.6 of noise alone."""
+"""Share of the slopes' energy that no surface has, from which their axes are asked about."""
 
 TURNED = {
     "y seems to count upwards, or x to the left: negate that component": (1.0, -1.0, False),

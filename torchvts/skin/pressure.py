@@ -19,8 +19,7 @@ BLUR_MM = 0.1
 """Blur of depth before its curvature is taken; 0.16 is as good on balls and 0.01 of IoU worse on shapes."""
 
 CONTACT_DECAY_MM = 0.45
-"""Longest L of contact, in frames and from presses; that of zero.py is chosen by depth. Up to 0.65 is 0.05 of IoU better on drawn
-shapes and 0.01 to 0.02 worse on balls on real sensors."""
+"""Longest L of contact, in frames and from presses; that of zero.py is chosen by depth."""
 
 SHARE = 0.3
 """Share of the frame's pressure where no press of a ball shows it: a unit's own is 0.15 to 0.6."""
@@ -38,8 +37,7 @@ RIM_MM = 0.4
 """Skin just inside a rim lies within this, either way."""
 
 FALL = 0.6
-"""Pressure at a rim, as a share of that just inside: it falls to zero there, and blur makes a slope of that step. Without
-it, IoU of drawn shapes is 0.88 in place of 0.91."""
+"""Pressure at a rim, as a share of that just inside: it falls to zero there, and blur makes a slope of that step."""
 
 PULL = 0.02
 """Skin pulls where its pressure is below minus this share of the largest depth: L of contact is longer than the skin's own."""

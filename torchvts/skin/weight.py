@@ -14,8 +14,7 @@ from ..model.lights import PointLights
 from .settings import ContactSettings
 
 WEIGHT_CELLS = 60
-"""Cells along the shorter side of the image. With 40, relief of drawn sensors is 3 % worse; with 80, 2 % better, and
-JPEG of free skin shows contact."""
+"""Cells along the shorter side of the image."""
 
 WEIGHT_RISE = (1.2, 3.0)
 """Evidence at which the weight leaves 0 and reaches 1. From 0.8 and 2.5 on relief is 1 % worse, all else equal."""
@@ -24,8 +23,7 @@ LEAST_SLOPE_SPREAD = 0.002
 """Least spread of slopes and of relative changes of light: half a count of 8 bits."""
 
 WITHIN = 2.5
-"""Standard deviations within which undeformed skin lies. With 3, more of the transition zone counts as undeformed, and depth of
-drawn sensors is 10 um lower; with 2 it is 6 um higher, and relief 3 % worse."""
+"""Standard deviations within which undeformed skin lies."""
 
 SQUARE_WITHIN = 0.9112565
 """Mean of x^2 of a standard Gaussian x within them."""

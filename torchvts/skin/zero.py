@@ -14,25 +14,22 @@ ZERO_CELLS = 30
 """Cells along the shorter side of the image, on which the offset is fitted."""
 
 WAVES = 8
-"""Cosine terms along the shorter side of which the offset is made; 12 and 16 give the same errors within 2 %."""
+"""Cosine terms along the shorter side of which the offset is made."""
 
 DECAY_MM = 1.5
-"""L, the length on which free skin decays. From 0.5 to 1.5 mm relief changes by 0.3 %, depth of drawn sensors by
-19 um."""
+"""L, the length on which free skin decays."""
 
 SMOOTH_MM = 0.35
-"""Slope of the offset that costs as much as a pressure of so many mm; from 0.12 to 1 relief changes by 0.3 %."""
+"""Slope of the offset that costs as much as a pressure of so many mm."""
 
 STIFF = 30.0
-"""How much stiffer the deepest skin is against the offset: slopes are calibrated in contacts, and least known around them. With 10
-relief is 1 % worse."""
+"""How much stiffer the deepest skin is against the offset: slopes are calibrated in contacts, and least known around them."""
 
 SCALES = (0.25, 0.1, 0.05)
 """Depth, as a share of the frame's range, beyond which unchanged skin is a face of the object; one round of the fit each."""
 
 PIT = 2.0
-"""Weight of depth below zero in moved skin: skin is pressed in and never pulled out. With 0, pits beside contacts that the image
-border cuts are 0.5 mm deep in place of 0.2."""
+"""Weight of depth below zero in moved skin: skin is pressed in and never pulled out."""
 
 PIT_SHARE = 0.01
 """Depth below zero that is left, as a share of the frame's range."""

@@ -56,7 +56,7 @@ CAUSES = [
     *(("Calibration.from_lights", "background", *row) for row in OF_IMAGES),
     *(("DepthPipeline.forward", "images", *row) for row in OF_BATCHES),
     ("Compensate.forward", "image", GOOD[None, :, :20, :30], "expected 24 x 32 like the calibration, got 20 x 30"),
-    ("DepthPipeline.from_calibration", "mode", "slow", "expected one of fast, precise, auto, got 'slow'"),
+    ("DepthPipeline.from_calibration", "mode", "slow", "expected one of fast, precise, got 'slow'"),
     ("DepthPipeline.from_calibration", "calibration", "unit.safetensors", "got str: Calibration.load reads a file"),
     ("Calibration.from_lights", "lights", [[0, 0, 1]], "expected PointLights, got list"),
     ("calibrate", "presses", [PRESS, image()], r"^presses\[1\]: expected a Press, got Tensor: Press\(image, ball_diameter_mm\)"),

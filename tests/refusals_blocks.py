@@ -204,6 +204,9 @@ TABLE = {
         named={"width": "(height, )?width"}, file=("source",)),
     "Sensor.resized": Entry({"height": 48, "width": 64}, {"height": [*INTEGER, 50], "width": [*INTEGER, 99]},
         lambda: sensor().resized, named={"width": "(height, )?width"}),
+    "Rectify": Entry({"sensor": sensor()}, {}),
+    "Rectify.forward": Entry(
+        {"raw": image()[None]}, {"raw": [*batches(3), torch.zeros(1, 3, 8, 8)]}, lambda: vts.Rectify(sensor())),
     "Sensor.rectify": Entry({"frame": image()[None]}, {"frame": [*batches(3), torch.zeros(1, 3, 8, 8)]}, lambda: sensor().rectify),
     "Sensor.read_image": Entry({"path": ...}, {"path": [*MISSING, "."]}, lambda: sensor().read_image, file=("path",), run=False),
     "Sensor.from_dict": Entry({"values": sensor().to_dict(), "source": "file"},

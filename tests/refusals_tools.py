@@ -84,8 +84,8 @@ TABLE = {
     "export.PoissonBackgroundByMatrix.forward": Entry({"gradient": torch.zeros(1, 2, HEIGHT, WIDTH)},
         {"gradient": [*batches(2), torch.zeros(1, 2, 8, 8)]},
         lambda: torchvts.export.PoissonBackgroundByMatrix(HEIGHT, WIDTH, 1.0)),
-    "export.describe": Entry({"pipe": pipe()}, {"pipe": [None, unit(), "pipeline.pt"]}),
-    **{f"export.{name}": Entry({"pipe": pipe(), "path": ...},
+    "export.describe": Entry({"pipe": pipe(), "rectify": None}, {"pipe": [None, unit(), "pipeline.pt"]}),
+    **{f"export.{name}": Entry({"pipe": pipe(), "path": ..., "rectify": vts.Rectify(sensor())},
         {"pipe": [None, unit(), "pipeline.pt"], "path": [Path("no/such.pt2"), "."]}, file=("path",), run=False)
         for name in ("export_torchscript", "export_program", "export_onnx")},
     "export.missing": Entry({"name": "pt2"}, {"name": ["pdf", None]}, named={"name": "format"}),

@@ -151,5 +151,5 @@ BAD_KNOWN = {
     "known_weight": [*BAD_WEIGHTS, KNOWN["known_weight"] - 2.0, KNOWN["known_weight"] + INF],
 }
 COMMON = {"height": INTEGER, "width": INTEGER, "mm_per_pixel": NUMBER, "sensor": SENSOR, "calibration": OTHERS}
-COMMON |= {"gradient": BAD_GRADIENT, "initial": BAD_POSE}
+COMMON |= {"gradient": BAD_GRADIENT, "initial": BAD_POSE, "rectify": [sensor(), "digit", vts.Rectify(vts.Sensor.load("digit"))]}
 """What an argument of this name refuses where its entry says nothing else."""

@@ -94,7 +94,14 @@ def network(dtype):
     return vts.NormalFromMLP(HEIGHT, WIDTH, calibration(torch.float32).background).requires_grad_(False).to(dtype)
 
 
+def rectify(dtype):
+    """Frames of 48 x 64 seen from aside, of which 24 x 32 pixels are made."""
+    corners = ((5.0, 3.0), (60.0, 8.0), (58.0, 44.0), (2.0, 40.0))
+    return vts.Rectify(vts.Sensor("camera", 24, 32, 0.6, corners_px=corners, raw_size_px=((HEIGHT, WIDTH),))).to(dtype)
+
+
 CASES = {
+    "Rectify": (rectify, images, "raw"),
     "Compensate": (part("compensate"), images, "image"),
     "ContactMask": (part("mask"), images, "compensated"),
     "NormalFromIntensity": (part("normals"), images, "compensated"),
@@ -117,7 +124,7 @@ CASES = {
     "DepthPipeline response precise": (response_pipe("precise"), images, "images"),
 }
 FREE = ("gradient", "normal", "depth_mm")
-SIZED = [name for name, (_, _, argument) in CASES.items() if argument not in FREE and name != "FillMarkers"]
+SIZED = [name for name, (_, _, argument) in CASES.items() if argument not in FREE and name not in ("FillMarkers", "Rectify")]
 IN_PYTHON = ("DiscontinuityIntegration", "AdaptiveIntegration")
 """Blocks whose solver is Python code, which no script holds."""
 SCRIPTED = [name for name in CASES if name not in IN_PYTHON]

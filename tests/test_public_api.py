@@ -11,7 +11,7 @@ NAMES = [
     "AdaptiveIntegration", "Calibration", "CalibrationWarning", "Compensate", "ConfidentPipeline", "ContactFromDepth",
     "ContactMask", "ContactSettings", "DepthOutput", "DepthPipeline", "FrozenPipeline", "GradientFromNormal", "Integrator",
     "NormalFromIntensity", "NormalFromLookup", "NormalFromMLP", "NormalFromResponse", "NormalModel", "PointLights",
-    "PoissonBackground", "PoissonDCT", "PoissonDST", "PoseTracker", "Press", "Result", "Sensor", "calibrate",
+    "PoissonBackground", "PoissonDCT", "PoissonDST", "PoseTracker", "Press", "Rectify", "Result", "Sensor", "calibrate",
     "depth_to_points",
     "diagnose", "fit_lights", "gs_sdk", "near_field_shading", "poisson_background", "poisson_dct", "poisson_dst",
     "read_image", "read_presses", "read_result", "register_depth", "register_points", "scenes", "shipped_sensors", "stream",

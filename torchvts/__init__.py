@@ -5,9 +5,9 @@
 
 * To calibrate: ``Press``, ``read_presses``, ``fit_lights``, ``PointLights``, ``CalibrationWarning``; ``gs_sdk`` reads
   the files of gs_sdk.
-* Parts of a pipeline, in its order: ``Compensate``, ``ContactMask``, a ``NormalModel``, ``GradientFromNormal``, an
-  ``Integrator``, ``ContactFromDepth``. Models are named ``NormalFrom...``, integrators ``Poisson...`` and
-  ``AdaptiveIntegration``; ``poisson_dct`` and the like are the same as functions.
+* Parts of a pipeline, in its order: ``Rectify`` (raw frames), ``Compensate``, ``ContactMask``, a ``NormalModel``,
+  ``GradientFromNormal``, an ``Integrator``, ``ContactFromDepth``. Models are named ``NormalFrom...``, integrators ``Poisson...``
+  and ``AdaptiveIntegration``; ``poisson_dct`` and the like are the same as functions.
 * With depth: ``depth_to_points``, ``register_depth``, ``PoseTracker``, ``ConfidentPipeline``, ``diagnose``, ``stream``.
   ``scenes`` has exact scenes for tests.
 
@@ -16,7 +16,7 @@ All parts are plain PyTorch modules. ``pipe.freeze()`` makes a ``FrozenPipeline`
 
 from . import scenes, stream
 from .calibration import CalibrationWarning, Press, calibrate, fit_lights, read_presses
-from .compensate import Compensate
+from .compensate import Compensate, Rectify
 from .core import __version__ as __version__
 from .core.files import read_image, write_image
 from .core.geometry import GradientFromNormal, depth_to_points
@@ -63,6 +63,7 @@ __all__ = [
     "PoissonDST",
     "PoseTracker",
     "Press",
+    "Rectify",
     "Result",
     "Sensor",
     "calibrate",

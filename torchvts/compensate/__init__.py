@@ -3,5 +3,6 @@
 from .compensate import Blur, Compensate
 from .defects import FillDefects
 from .light import AsItIs, Relight, unchanged_light
+from .rectify import Rectify
 
-__all__ = ["AsItIs", "Blur", "Compensate", "FillDefects", "Relight", "unchanged_light"]
+__all__ = ["AsItIs", "Blur", "Compensate", "FillDefects", "Rectify", "Relight", "unchanged_light"]

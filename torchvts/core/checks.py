@@ -181,6 +181,10 @@ def check_batch(name: str, tensor: Tensor, channels: int) -> None:
         cause = "see the docstring for shapes"
         if tensor.shape[3] == channels:
             cause = "channels stand last: permute(0, 3, 1, 2)"
+        elif channels == 3 and tensor.shape[1] == 1:
+            cause = "grey images: slopes need the three colours of the light, read the camera in colour"
+        elif channels == 3 and tensor.shape[1] == 4:
+            cause = "with an alpha channel: image[:, :3] leaves it out"
         raise ValueError(f"{name}: expected (B, {channels}, H, W), got {list(tensor.shape)}: {cause}")
     if tensor.shape[2] == 0 or tensor.shape[3] == 0:
         raise ValueError(f"{name}: expected images of at least one pixel, got {list(tensor.shape)}: was the file empty?")

@@ -1,7 +1,7 @@
 """The writers: a pipeline as one file in TorchScript, torch.export or ONNX.
 
-Every file takes images (B, 3, H, W) of the pipeline's size, any B (at most 1024 by torch.export), and returns depth_mm,
-gradient, normal, contact and deformed in that order.
+Every file takes images (B, 3, H, W) of the pipeline's size, or with ``rectify`` raw frames of the camera, any B (at most 1024 by
+torch.export), and returns depth_mm, gradient, normal, contact and deformed in that order.
 """
 
 import copy
@@ -15,13 +15,14 @@ from typing import Any
 
 import torch
 
+from ..compensate import Rectify
 from ..core import __version__
 from ..core.checks import check_choice, check_record
 from ..core.files import check_target, write_atomically
 from ..integration import AdaptiveIntegration, DiscontinuityIntegration
 from ..pipeline import DepthPipeline
 from .onnx_operators import InOnnxOperators, simplify
-from .trace import size_and_dtype, trace
+from .trace import FromRaw, size_and_dtype, trace
 
 METADATA_KEY = "torchvts"
 """Name under which a file keeps its metadata (:func:`describe`) as JSON."""
@@ -30,10 +31,11 @@ OUTPUTS = ("depth_mm", "gradient", "normal", "contact", "deformed")
 """Names of the outputs of an exported file, in order."""
 
 
-def describe(pipe: DepthPipeline) -> dict[str, Any]:
+def describe(pipe: DepthPipeline, rectify: Rectify | None = None) -> dict[str, Any]:
     """The metadata of an exported file: plain JSON."""
     check_pipeline(pipe)
     height, width, dtype = size_and_dtype(pipe)
+    check_rectify(rectify, (height, width))
     return {
         "torchvts": __version__,
         "torch": str(torch.__version__),
@@ -43,7 +45,8 @@ def describe(pipe: DepthPipeline) -> dict[str, Any]:
         "width": width,
         "mm_per_pixel": pipe.mm_per_pixel,
         "dtype": str(dtype).removeprefix("torch."),
-        "input": "images (B, 3, H, W) in [0, 1], channels R, G, B, rectified",
+        "input": f"images (B, 3, H, W) in [0, 1], channels R, G, B, {'rectified' if rectify is None else 'raw frames'}",
+        "raw_size_px": [] if rectify is None else [list(size) for size in rectify.view.raw_sizes],
         "outputs": list(OUTPUTS),
     }
 
@@ -59,62 +62,87 @@ def check_pipeline(pipe: object) -> None:
         )
 
 
-def export_torchscript(pipe: DepthPipeline, path: str | Path) -> Path:
+def check_rectify(rectify: object, size: tuple[int, int]) -> None:
+    """Raise unless ``rectify`` is None, or a Rectify that makes images of ``size``."""
+    if rectify is None:
+        return
+    check_record("rectify", rectify, Rectify, "Rectify(calibration.sensor) makes one")
+    assert isinstance(rectify, Rectify)
+    if rectify.view.size != size:
+        raise ValueError(f"rectify: expected images of {size[0]} x {size[1]} like the pipeline, got {rectify}: of another sensor?")
+
+
+def export_torchscript(pipe: DepthPipeline, path: str | Path, rectify: Rectify | None = None) -> Path:
     """Write a pipeline as TorchScript (.pt), for ``torch.jit.load`` and C++ libtorch. It stays differentiable.
 
     Its extra file ``torchvts.json`` is :func:`describe`. Returns the path.
 
+    Args:
+        pipe: the pipeline.
+        path: the file.
+        rectify: what makes its images of raw frames, which the file then takes; None for images that are rectified.
     Raises:
         RuntimeError: a module of the pipeline does not script.
-        TypeError: no pipeline.
+        TypeError: no pipeline, or no Rectify.
+        ValueError: a Rectify that makes images of another size.
     """
     check_pipeline(pipe)
     path = check_target(path)
     with warnings.catch_warnings(), write_atomically(path) as temporary:
         warnings.simplefilter("ignore")  # that TorchScript is deprecated
-        scripted = torch.jit.script(copy.deepcopy(pipe).eval())
-        metadata = {f"{METADATA_KEY}.json": json.dumps(describe(pipe))}
+        metadata = {f"{METADATA_KEY}.json": json.dumps(describe(pipe, rectify))}
+        scripted = torch.jit.script(copy.deepcopy(pipe if rectify is None else FromRaw(rectify, pipe)).eval())
         scripted.save(str(temporary), _extra_files=metadata)  # type: ignore[no-untyped-call]
     return path
 
 
-def export_program(pipe: DepthPipeline, path: str | Path | None = None) -> torch.export.ExportedProgram:
+def export_program(
+    pipe: DepthPipeline, path: str | Path | None = None, rectify: Rectify | None = None
+) -> torch.export.ExportedProgram:
     """Trace a pipeline by torch.export, in any mode, for any batch, and write it (.pt2) for ``torch.export.load``.
 
-    Without a path the program is returned and not written.
-
+    Args:
+        pipe: the pipeline.
+        path: the file; without one the program is returned and not written.
+        rectify: as :func:`export_torchscript`; of a sensor of one raw size, since a graph has one.
     Raises:
-        TypeError: no pipeline.
+        TypeError: no pipeline, or no Rectify.
+        ValueError: a Rectify that makes images of another size, or of frames of several sizes.
         Exception: what torch.export raises for a module of yours that it cannot trace.
     """
     check_pipeline(pipe)
     if path is not None:
         check_target(path)
-    program = trace(pipe, by_matrix=False)
+    metadata = {f"{METADATA_KEY}.json": json.dumps(describe(pipe, rectify))}
+    program = trace(pipe, by_matrix=False, rectify=rectify)
     if path is not None:
         with write_atomically(path) as temporary, warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            metadata = {f"{METADATA_KEY}.json": json.dumps(describe(pipe))}
             torch.export.save(program, temporary, extra_files=metadata)
     return program
 
 
-def export_onnx(pipe: DepthPipeline, path: str | Path) -> Path:
+def export_onnx(pipe: DepthPipeline, path: str | Path, rectify: Rectify | None = None) -> Path:
     """Write a pipeline as ONNX, for ONNX Runtime and other readers. Its metadata entry ``torchvts`` is :func:`describe`.
 
     Returns the path.
 
+    Args:
+        pipe: the pipeline.
+        path: the file.
+        rectify: as :func:`export_program`.
     Raises:
         ModuleNotFoundError: the extra ``onnx`` is not installed.
-        TypeError: no pipeline.
+        TypeError, ValueError: as :func:`export_program`.
     """
     check_pipeline(pipe)
     path = check_target(path)
     complaint = missing("onnx")
     if complaint:
         raise ModuleNotFoundError(complaint)
+    metadata = json.dumps(describe(pipe, rectify))
     with InOnnxOperators():
-        program = trace(pipe, by_matrix=True)
+        program = trace(pipe, by_matrix=True, rectify=rectify)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         model = torch.onnx.export(
@@ -129,7 +157,7 @@ def export_onnx(pipe: DepthPipeline, path: str | Path) -> Path:
         if model is None:
             raise RuntimeError("onnx: the exporter returned no model")
         simplify(model.model)
-        model.model.metadata_props[METADATA_KEY] = json.dumps(describe(pipe))
+        model.model.metadata_props[METADATA_KEY] = metadata
         with write_atomically(path) as temporary:
             model.save(temporary, external_data=False)
     return path

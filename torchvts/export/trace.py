@@ -6,10 +6,11 @@ import warnings
 import torch
 from torch import Tensor, nn
 
+from ..compensate import Rectify
 from ..core.checks import check_batch, check_dtype, check_same_size, check_size, check_switch
 from ..integration import Integrator, PoissonDCT, divergence
 from ..integration.transforms import cosine_bases, fold, unfold
-from ..pipeline import DepthPipeline, Shadows
+from ..pipeline import DepthOutput, DepthPipeline, Shadows
 
 MAX_BATCH = 1024
 """Largest batch that the graph formats accept."""
@@ -76,10 +77,22 @@ class PoissonBackgroundByMatrix(Integrator):
         return depth - torch.where(count > 0, mean, depth.amin(dim=(2, 3), keepdim=True))
 
 
+class FromRaw(nn.Module):
+    """Raw frames of the camera to the outputs of a pipeline."""
+
+    def __init__(self, rectify: Rectify, pipe: DepthPipeline) -> None:
+        super().__init__()
+        self.rectify = rectify
+        self.pipe = pipe
+
+    def forward(self, images: Tensor) -> DepthOutput:
+        return self.pipe(self.rectify(images))
+
+
 class _PlainOutput(nn.Module):
     """A pipeline that returns a plain tuple: a file with a NamedTuple of torchvts would need torchvts to be read."""
 
-    def __init__(self, pipe: DepthPipeline) -> None:
+    def __init__(self, pipe: nn.Module) -> None:
         super().__init__()
         self.pipe = pipe
 
@@ -100,18 +113,31 @@ def size_and_dtype(pipe: DepthPipeline) -> tuple[int, int, torch.dtype]:
     raise ValueError("pipe: expected blocks that know the size of the calibration, as from_calibration makes them, got none")
 
 
-def trace(pipe: DepthPipeline, by_matrix: bool) -> torch.export.ExportedProgram:
-    """Trace a copy of a pipeline for any batch; ``by_matrix`` replaces its Poisson solvers by matrix products."""
+def trace(pipe: DepthPipeline, by_matrix: bool, rectify: Rectify | None = None) -> torch.export.ExportedProgram:
+    """Trace a copy of a pipeline, with ``rectify`` from raw frames, for any batch; ``by_matrix``: no FFT, but matrix products."""
     height, width, dtype = size_and_dtype(pipe)
     pipe = copy.deepcopy(pipe).eval().requires_grad_(False)
     if by_matrix:
         _use_matrices(pipe, height, width, dtype)
     images = torch.full((2, 3, height, width), 0.5, dtype=dtype)
     _make_tables(pipe, images)
+    whole: nn.Module = pipe
+    if rectify is not None:
+        whole, images = FromRaw(copy.deepcopy(rectify), pipe), torch.full((2, 3, *_raw_size(rectify)), 0.5, dtype=dtype)
     shapes = ({0: torch.export.Dim("batch", min=1, max=MAX_BATCH)},)
     with torch.no_grad(), warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        return torch.export.export(_PlainOutput(pipe), (images,), dynamic_shapes=shapes, strict=False)
+        return torch.export.export(_PlainOutput(whole), (images,), dynamic_shapes=shapes, strict=False)
+
+
+def _raw_size(rectify: Rectify) -> tuple[int, int]:
+    sizes = rectify.view.raw_sizes
+    if len(sizes) != 1:
+        raise ValueError(
+            f"rectify: expected a sensor of one raw size, got {sizes}: a graph takes frames of one size; "
+            "dataclasses.replace(sensor, raw_size_px=((height, width),)) states it"
+        )
+    return sizes[0]
 
 
 def _use_matrices(pipe: DepthPipeline, height: int, width: int, dtype: torch.dtype) -> None:

@@ -2,65 +2,180 @@
 
 import math
 from functools import lru_cache
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
 from ..core.checks import brief, check_numbers
 
+if TYPE_CHECKING:
+    from .sensor import Sensor
+
 Corners = tuple[tuple[float, float], ...]
 Matrix = tuple[tuple[float, ...], ...]
 
+MOST_BEYOND_PX = 1.0
+"""Frames are sampled up to so far beyond their edge, px, where their outermost pixel is repeated."""
+
 
 class CameraView(NamedTuple):
-    """Makes images (B, 3, height, width) of raw frames (B, 3, H, W); the fields are those of :class:`Sensor`.
+    """What is taken of raw frames, as numbers that a script can hold; :attr:`Sensor.view` makes it.
 
-    Raises:
-        ValueError: a frame that does not contain the region.
+    Attributes:
+        name: the sensor's.
+        size: height and width of its images.
+        raw_sizes: heights and widths of raw frames; none where all are that hold the place.
+        turn_deg: anticlockwise turn, 0, 90, 180 or 270.
+        mirror: whether turned frames are mirrored left to right.
+        place: "roi_px" or "corners_px", what says where the gel lies; "" where frames are cropped.
+        extent_px: left, top, right and bottom of that place, pixel centres.
+        raw_crop: share to cut off each side.
+        bent: whether the distortion of a lens is taken out.
     """
 
     name: str
     size: tuple[int, int]
+    raw_sizes: list[tuple[int, int]]
     turn_deg: int
     mirror: bool
-    roi_px: tuple[int, int, int, int] | None
-    corners_px: Corners | None
+    place: str
+    extent_px: tuple[float, float, float, float]
     raw_crop: float
-    camera_matrix: Matrix | None
-    distortion_coefficients: tuple[float, ...] | None
+    bent: bool
 
-    def __call__(self, frame: Tensor) -> Tensor:
-        if self.camera_matrix is None:
-            image = self.cut(frame)
-        else:
-            image = _sampled(frame, _straight_grid(self, (frame.shape[2], frame.shape[3]), frame.dtype))
-        return image if image.shape[2:] == self.size else _resized(image, self.size)
 
-    def cut(self, frame: Tensor) -> Tensor:
-        """Frames (B, C, H, W) turned, mirrored and cut; of the sensor's size only where there are corners."""
-        if self.turn_deg:
-            frame = frame.rot90(self.turn_deg // 90, (2, 3)).contiguous()
-        if self.mirror:
-            frame = frame.flip(3)
-        height, width = frame.shape[2], frame.shape[3]
-        if self.corners_px is not None:
-            x, y = zip(*self.corners_px, strict=True)
-            if min(*x, *y) < -0.5 or max(x) > width - 0.5 or max(y) > height - 0.5:
-                raise self._missing("corners_px", height, width, self.corners_px)
-            return _sampled(frame, _corners_grid(self.corners_px, self.size, (height, width), frame.dtype))
-        if self.roi_px is not None:
-            left, top, roi_width, roi_height = self.roi_px
-            if left + roi_width > width or top + roi_height > height:
-                raise self._missing("roi_px", height, width, self.roi_px)
-            return frame[:, :, top : top + roi_height, left : left + roi_width]
-        top, left = int(self.raw_crop * height), int(self.raw_crop * width)
-        return frame[:, :, top : height - top, left : width - left]
+def is_raw(name: str, frame: Tensor, view: CameraView) -> bool:
+    """Whether frames (B, 3, h, w) are raw, or the sensor's images already. Scripts.
 
-    def _missing(self, key: str, height: int, width: int, value: object) -> ValueError:
-        turned = f", turned by {self.turn_deg} degrees," if self.turn_deg else ""
-        return ValueError(f"frame: {height} x {width}{turned} does not contain {key} {value} of sensor '{self.name}'")
+    Raises:
+        ValueError: they are neither; says what they may be.
+    """
+    rows, columns = frame.shape[2], frame.shape[3]
+    for height, width in view.raw_sizes:
+        if rows == height and columns == width:
+            return True
+    if view.place != "" and len(view.raw_sizes) == 0:
+        return True
+    if view.place != "" or rows != view.size[0] or columns != view.size[1]:
+        raise ValueError(f"{name}: {_misfit(view, rows, columns)}")
+    return False
+
+
+def rectified(name: str, frame: Tensor, view: CameraView, places: Tensor | None) -> Tensor:
+    """Images (B, 3, height, width) of raw frames (B, 3, h, w), sampled once and resized at most once. Scripts.
+
+    Args:
+        name: of the frames in errors.
+        frame: raw frames.
+        view: what is taken of them.
+        places: (1, h, w, 2) from :func:`places_in_frame`.
+    Raises:
+        ValueError: frames that do not contain the place of the gel.
+    """
+    image = _sampled(frame, places) if view.bent and places is not None else _taken(name, frame, view, places)
+    if image.shape[2] != view.size[0] or image.shape[3] != view.size[1]:
+        image = nn.functional.interpolate(image, view.size, mode="bilinear", align_corners=False, antialias=True)
+    return image
+
+
+@lru_cache(maxsize=8)
+def places_in_frame(sensor: "Sensor", frame_size: tuple[int, int]) -> Tensor | None:
+    """Where each pixel of what is taken lies in frames of a size, (1, h, w, 2), x and y, px, float64; None where it is cut out.
+
+    Behind a lens in raw frames, otherwise in turned and mirrored ones, on whose size it does not depend.
+
+    Raises:
+        ValueError: behind a lens, places beyond the frame.
+    """
+    if sensor.corners_px is None and sensor.camera_matrix is None:
+        return None
+    from kornia.geometry import get_perspective_transform, transform_points  # takes 0.4 s; most sensors do without
+    from kornia.geometry.calibration import distort_points
+
+    with torch.inference_mode(False):
+        corners = None
+        if sensor.corners_px is not None:
+            height, width = sensor.height, sensor.width
+            outline = ((0.0, 0.0), (width - 1.0, 0.0), (width - 1.0, height - 1.0), (0.0, height - 1.0))
+            image, frame = (torch.tensor([points], dtype=torch.float64) for points in (outline, sensor.corners_px))
+            corners = transform_points(get_perspective_transform(image, frame), _pixels(height, width)).reshape(1, height, width, 2)
+        if sensor.camera_matrix is None:
+            return corners
+        rows, columns = frame_size
+        matrix, coefficients = (
+            torch.tensor([values], dtype=torch.float64) for values in (sensor.camera_matrix, sensor.distortion_coefficients)
+        )
+        seen = distort_points(_pixels(rows, columns), matrix, coefficients).reshape(1, rows, columns, 2)
+        # taken as frames are, so that frames are sampled once
+        places = _taken("frame", seen.permute(0, 3, 1, 2), sensor.view, corners).permute(0, 2, 3, 1).contiguous()
+        beyond = float(torch.maximum(-places, places - torch.tensor([columns - 1.0, rows - 1.0], dtype=torch.float64)).max())
+        if beyond > MOST_BEYOND_PX:
+            raise ValueError(
+                f"frame: of {rows} x {columns} sensor '{sensor.name}' needs pixels up to {beyond:.0f} beyond its edge, by its "
+                "camera_matrix and distortion_coefficients: cut less out of it, by roi_px, corners_px or raw_crop"
+            )
+        return places
+
+
+def _pixels(height: int, width: int) -> Tensor:
+    """x and y of all pixels, (1, height * width, 2)."""
+    y, x = torch.meshgrid(torch.arange(height, dtype=torch.float64), torch.arange(width, dtype=torch.float64), indexing="ij")
+    return torch.stack((x, y), 2).reshape(1, -1, 2)
+
+
+def _taken(name: str, frame: Tensor, view: CameraView, corners: Tensor | None) -> Tensor:
+    """Frames (B, C, h, w) turned, mirrored, and cut or, with the places of corners, sampled."""
+    if view.turn_deg != 0:
+        frame = frame.rot90(view.turn_deg // 90, (2, 3)).contiguous()
+    if view.mirror:
+        frame = frame.flip(3)
+    rows, columns = frame.shape[2], frame.shape[3]
+    left, top, right, bottom = view.extent_px
+    if view.place != "" and (min(left, top) < -0.5 or right > columns - 0.5 or bottom > rows - 0.5):
+        turned = f", turned by {view.turn_deg} degrees," if view.turn_deg != 0 else ""
+        raise ValueError(
+            f"{name}: {rows} x {columns}{turned} does not contain {view.place} of sensor '{view.name}', columns {left} to "
+            f"{right} and rows {top} to {bottom}"
+        )
+    if corners is not None:
+        return _sampled(frame, corners)
+    if view.place != "":
+        return frame[:, :, int(top) : int(bottom) + 1, int(left) : int(right) + 1]
+    down, across = int(view.raw_crop * rows), int(view.raw_crop * columns)
+    return frame[:, :, down : rows - down, across : columns - across]
+
+
+def _sampled(frame: Tensor, places: Tensor) -> Tensor:
+    """Frames (B, C, h, w) at places (1, height, width, 2), bilinearly, as kornia's ``remap``: to load it takes 0.4 s."""
+    places = places.to(frame.device, frame.dtype)
+    x, y = 2.0 / (frame.shape[3] - 1) * places[..., 0] - 1.0, 2.0 / (frame.shape[2] - 1) * places[..., 1] - 1.0
+    grid = torch.stack((x, y), 3).expand(frame.shape[0], -1, -1, -1)
+    return nn.functional.grid_sample(frame, grid, mode="bilinear", padding_mode="border", align_corners=True)
+
+
+def _misfit(view: CameraView, rows: int, columns: int) -> str:
+    """Why frames of a size are neither raw nor the sensor's images, and what would make them so."""
+    height, width = view.size
+    raw = " or ".join([f"{some} x {more}" for some, more in view.raw_sizes])
+    if view.place != "":
+        expected = f"raw frames of {raw}, in which sensor '{view.name}' has its {view.place}"
+        cause = "another mode of the camera"
+        first_rows, first_columns = view.raw_sizes[0]
+        if rows * first_columns == columns * first_rows:
+            cause += f", of another resolution: resize frames, or measure {view.place} and raw_size_px in these"
+        return f"expected {expected}, got {rows} x {columns}: {cause}"
+    own = width / height
+    cause = "another aspect ratio, so another sensor, crop or mode of the camera"
+    if abs(columns / rows / own - 1.0) <= 0.01:
+        cause = f"resize it, load the sensor with height={rows}, width={columns}, or give it roi_px: [0, 0, {columns}, {rows}]"
+        if view.raw_crop > 0.0:
+            cause = f"frames as the camera gives them? then the sensor file needs [{rows}, {columns}] in raw_size_px, too"
+    elif abs(rows / columns / own - 1.0) <= 0.01:
+        turn = f"turn_deg: {view.turn_deg}" if view.turn_deg % 180 != 0 else "turn_deg: 90 (or 270)"
+        cause = f"height and width exchanged? or a turned camera: it needs {turn}, and raw_size_px: [[{rows}, {columns}]] alone"
+    others = f", or raw frames of {raw}," if raw != "" else ""
+    return f"expected {height} x {width}{others} for sensor '{view.name}', got {rows} x {columns}: {cause}"
 
 
 def check_corners(value: object) -> Corners:
@@ -109,55 +224,3 @@ def check_lens(matrix: object, coefficients: object) -> tuple[Matrix, tuple[floa
         )
     rows = tuple(numbers[i : i + 3] for i in (0, 3, 6))
     return rows, check_numbers("distortion_coefficients", coefficients, (len(coefficients),))
-
-
-def _sampled(frame: Tensor, grid: Tensor) -> Tensor:
-    """Frames (B, C, H, W) at the places of a grid (1, h, w, 2)."""
-    grid = grid.to(frame.device).expand(frame.shape[0], -1, -1, -1)
-    return nn.functional.grid_sample(frame, grid, mode="bilinear", padding_mode="border", align_corners=True)
-
-
-@lru_cache(maxsize=4)
-def _straight_grid(view: CameraView, frame_size: tuple[int, int], dtype: torch.dtype) -> Tensor:
-    """Where each pixel of what is cut out of a frame without distortion lies in the frame, as by :func:`_corners_grid`.
-
-    The places are cut as frames are, so that frames are sampled once.
-    """
-    import cv2
-
-    rows, columns = frame_size
-    matrix, coefficients = np.array(view.camera_matrix), np.array(view.distortion_coefficients)
-    maps = cv2.initUndistortRectifyMap(matrix, coefficients, np.eye(3), matrix, (columns, rows), cv2.CV_32FC1)
-    with torch.inference_mode(False):
-        place = view.cut(torch.from_numpy(np.stack(maps)).double()[None])  # (1, 2, h, w)
-        most = torch.tensor([columns - 1.0, rows - 1.0], dtype=torch.float64)[None, :, None, None]
-        beyond = float(torch.maximum(-place, place - most).max())
-        if beyond > 1.0:
-            raise ValueError(
-                f"frame: of {rows} x {columns} sensor '{view.name}' needs pixels up to {beyond:.0f} beyond its edge, by its "
-                "camera_matrix and distortion_coefficients: cut less out of it, by roi_px, corners_px or raw_crop"
-            )
-        return (2.0 * place / most - 1.0).permute(0, 2, 3, 1).to(dtype)
-
-
-@lru_cache(maxsize=16)
-def _corners_grid(corners_px: Corners, size: tuple[int, int], frame_size: tuple[int, int], dtype: torch.dtype) -> Tensor:
-    """Where each pixel of an image of ``size`` lies in frames of ``frame_size``, (1, height, width, 2), from -1 to 1."""
-    (height, width), (rows, columns) = size, frame_size
-    with torch.inference_mode(False):
-        outline = ((0.0, 0.0), (width - 1.0, 0.0), (width - 1.0, height - 1.0), (0.0, height - 1.0))
-        image, frame = (torch.tensor([points], dtype=torch.float64) for points in (outline, corners_px))
-        import kornia  # takes 0.3 to 0.5 s, and frames of the calibrated size do without
-
-        to_frame = kornia.geometry.get_perspective_transform(image, frame)[0]
-        x = torch.arange(width, dtype=torch.float64).expand(height, -1)
-        y = torch.arange(height, dtype=torch.float64)[:, None].expand(-1, width)
-        place = torch.stack((x, y, torch.ones_like(x)), 2) @ to_frame.T
-        place = place[..., :2] / place[..., 2:]
-        return (2.0 * place / torch.tensor([columns - 1.0, rows - 1.0], dtype=torch.float64) - 1.0)[None].to(dtype)
-
-
-def _resized(frame: Tensor, size: tuple[int, int]) -> Tensor:
-    """Frames (B, 3, H, W) at another size, smoothed where they become smaller."""
-    resized = nn.functional.interpolate(frame, size, mode="bilinear", align_corners=False, antialias=True)
-    return resized.clamp(0.0, 1.0)

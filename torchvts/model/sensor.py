@@ -29,7 +29,16 @@ from ..core.files import read_image, write_atomically
 from ..core.geometry import check_rigid
 from ..core.spelling import suggest
 from ..core.strict_yaml import read_yaml
-from .camera_view import CameraView, check_corners, check_lens, check_raw_sizes, sides_of
+from .camera_view import (
+    CameraView,
+    check_corners,
+    check_lens,
+    check_raw_sizes,
+    is_raw,
+    places_in_frame,
+    rectified,
+    sides_of,
+)
 from .gs_sdk_sensor import is_gs_sdk_sensor, values_from_gs_sdk
 from .response_field import SensorPrior
 
@@ -247,12 +256,9 @@ class Sensor:
             torch.Size([1, 3, 320, 240])
         """
         check_batch("frame", frame, 3)
-        size = (frame.shape[2], frame.shape[3])
-        if size in self.raw_size_px or (self.cuts_a_place and not self.raw_size_px):
-            return self._view(frame)
-        if size != (self.height, self.width) or self.cuts_a_place:
-            raise ValueError(self._misfit(*size))
-        return frame
+        if not is_raw("frame", frame, self.view):
+            return frame
+        return rectified("frame", frame, self.view, places_in_frame(self, (frame.shape[2], frame.shape[3])))
 
     @property
     def cuts_a_place(self) -> bool:
@@ -273,40 +279,23 @@ class Sensor:
         return self.turn_deg != 0 or self.mirror or self.camera_matrix is not None
 
     @property
-    def _view(self) -> CameraView:
-        size = (self.height, self.width)
+    def view(self) -> CameraView:
+        """What is taken of raw frames."""
+        extent, place = (0.0, 0.0, 0.0, 0.0), ""
+        if self.place_px is not None:
+            x, y = zip(*self.place_px, strict=True)
+            last = 0 if self.roi_px is None else 1  # a region ends before its last corner
+            extent, place = (min(x), min(y), max(x) - last, max(y) - last), "corners_px" if self.roi_px is None else "roi_px"
         return CameraView(
-            self.name,
-            size,
-            self.turn_deg,
-            self.mirror,
-            self.roi_px,
-            self.corners_px,
-            self.raw_crop,
-            self.camera_matrix,
-            self.distortion_coefficients,
-        )
-
-    def _misfit(self, height: int, width: int) -> str:
-        """Why a frame of another size does not fit, and what would make it fit."""
-        raw = " or ".join(f"{rows} x {columns}" for rows, columns in self.raw_size_px)
-        if self.cuts_a_place:
-            return (
-                f"frame: expected raw frames of {raw}, in which sensor '{self.name}' has its "
-                f"{'corners_px' if self.roi_px is None else 'roi_px'}, got {height} x {width}: another mode of the camera"
-            )
-        own = self.width / self.height
-        cause = "another aspect ratio, so another sensor, crop or mode of the camera"
-        if abs(width / height / own - 1.0) <= 0.01:
-            cause = f"resize it, load the sensor with height={height}, width={width}, or give it roi_px: [0, 0, {width}, {height}]"
-            if self.raw_crop > 0:
-                cause = f"frames as the camera gives them? then the sensor file needs [{height}, {width}] in raw_size_px, too"
-        elif abs(height / width / own - 1.0) <= 0.01:
-            turn = f"turn_deg: {self.turn_deg}" if self.turn_deg % 180 else "turn_deg: 90 (or 270)"
-            cause = f"height and width exchanged? or a turned camera: it needs {turn}, and raw_size_px: [[{height}, {width}]] alone"
-        return (
-            f"frame: expected {self.height} x {self.width}{raw and f', or raw frames of {raw},'} for sensor '{self.name}', "
-            f"got {height} x {width}: {cause}"
+            name=self.name,
+            size=(self.height, self.width),
+            raw_sizes=list(self.raw_size_px),
+            turn_deg=self.turn_deg,
+            mirror=self.mirror,
+            place=place,
+            extent_px=extent,
+            raw_crop=self.raw_crop,
+            bent=self.camera_matrix is not None,
         )
 
     def read_image(self, path: str | Path) -> Tensor:

@@ -43,6 +43,9 @@ _MAP = LinearSegmentedColormap.from_list(
 SOURCE, TARGET = "#d55e00", "#0072b2"
 """Colours of the two clouds of a pose; blue and vermilion, which all readers distinguish."""
 
+DOUBT = "#a63603"
+"""Colour of doubts in the picture of a frame."""
+
 NAME_SHOWN = 22
 """Characters of a name in a title."""
 
@@ -93,6 +96,8 @@ def depth_figure(
     contact: Tensor | None = None,
     title: str = "",
     exaggeration: float | None = None,
+    metric: bool = True,
+    doubts: Sequence[str] = (),
 ) -> Figure:
     """One frame as three panels of one extent: the camera's image with the contact outlined, depth contours, the shaded surface.
 
@@ -103,11 +108,16 @@ def depth_figure(
         contact: bool, the same shape as depth.
         title: text above the panels.
         exaggeration: of the surface's heights; None takes :func:`exaggeration_of` this depth.
+        metric: whether depth is in mm; otherwise the title and the bar say that it is not.
+        doubts: why not to trust it, a sentence each, above the panels.
     """
     depth = _plane(depth_mm)
+    title += "" if metric else ", NOT METRIC"
     ratio = depth.shape[0] / depth.shape[1]
     wide = 2.45 if ratio < 1.0 else 2.0
-    high, left, top = wide * ratio, 0.6, 0.62 if title else 0.32
+    text = "\n".join("\n".join(textwrap.wrap(doubt, 75 * (2 if image is None else 3) // 2 + 40)) for doubt in doubts)
+    above = (0.62 if title else 0.32) + (0.05 + 0.16 * (text.count("\n") + 1) if text else 0.0)
+    high, left, top = wide * ratio, 0.6, above
     total = high + top + 0.5
     count = 1 if image is None else 2
     size = (left + count * (wide + 0.5) + 0.45 + 3.4, total)
@@ -128,13 +138,15 @@ def depth_figure(
         _millimetres(axes)
         left += wide + 0.5
     axes = panel(left, lower, wide, high)
-    draw_contours(figure, axes, depth, mm_per_pixel)
+    draw_contours(figure, axes, depth, mm_per_pixel, metric=metric)
     if image is not None:
         axes.set_ylabel("")
     space = panel(left + wide + 0.55, 0.0, size[0] - left - wide - 0.75, lower + high, projection="3d")
     draw_surface(space, depth, mm_per_pixel, exaggeration=exaggeration)
     if title:
         figure.suptitle(title, fontsize=11, y=1.0 - 0.08 / size[1], va="top")
+    if text:
+        figure.text(0.5, 1.0 - (0.34 if title else 0.06) / size[1], text, fontsize=9, color=DOUBT, ha="center", va="top")
     return figure
 
 
@@ -153,6 +165,7 @@ def draw_contours(
     mm_per_pixel: float,
     step_mm: float | None = None,
     range_mm: tuple[float, float] | None = None,
+    metric: bool = True,
 ) -> None:
     """Draw depth in colour, with contour lines every round part of a millimetre and a colour bar.
 
@@ -163,13 +176,14 @@ def draw_contours(
         mm_per_pixel: pixel pitch, mm.
         step_mm: distance of the lines, mm; None chooses it.
         range_mm: range of the colours, for panels that are compared; None takes that of the depth (:func:`depth_range`).
+        metric: whether depth is in mm; otherwise the bar says that it is not.
     """
     low, high = range_mm or depth_range(depth)
     colors, norm = depth_colors(low, high)
     picture = axes.imshow(depth, cmap=colors, norm=norm, extent=_extent(depth, mm_per_pixel))
     step = step_mm or _round_step(high - low)
     _draw_lines(axes, depth.clip(low, high), mm_per_pixel, step, colors, norm)
-    draw_bar(figure, axes, picture, "depth, mm")
+    draw_bar(figure, axes, picture, "depth, mm" if metric else "depth, NOT METRIC")
     axes.set_title(f"depth, a line every {step:g} mm", fontsize=10)
     _millimetres(axes)
 

@@ -36,11 +36,14 @@ def crop(image):
 MISTAKES = {
     "channels": (
         lambda image: image.flip(0),
-        "expected the background's view of the skin, got .*swapped to the order B, G, R: with",
+        "expected the background's view of the skin, got .*swapped to the order B, G, R ",
     ),
-    "channels 2": (lambda image: image[[1, 2, 0]], "channels swapped to the order G, B, R: with that undone it differs"),
-    "turned": (lambda image: image.flip(1, 2), "is turned by 180 degrees: with that undone it differs"),
-    "mirrored": (lambda image: image.flip(2), "is mirrored left to right: with that undone it differs"),
+    "channels 2": (
+        lambda image: image[[1, 2, 0]],
+        "channels swapped to the order G, B, R \\(2?[0-9]% off the background with that undone",
+    ),
+    "turned": (lambda image: image.flip(1, 2), "is turned by 180 degrees \\([0-9]% off the background with that undone"),
+    "mirrored": (lambda image: image.flip(2), "is mirrored left to right \\([0-9]% off the background"),
     "both": (lambda image: image.flip(0, 1), "is mirrored top to bottom and has its channels swapped to the order B, G, R"),
     "cropped": (crop, "(shows less than the background, by 10% of each side|another light, or another crop)"),
     "12 bits": (lambda image: (image * 4080).round() / 65535, r"brightness like the background's, got 6% .*12 bits stored in 16\?"),

@@ -191,7 +191,7 @@ def test_a_turned_mirrored_or_swapped_background_is_named(change):
     sensor = dataclasses.replace(SENSOR, prior=prior(other_light()))
     image = CHANGED[change](camera(other_light()))
     _, warned = calibrate(image, sensor)
-    assert any(f"{change}: with that undone it differs from the background by " in text for text in warned), warned
+    assert any(f"it {change if change[:3] == 'has' else 'is ' + change} (" in text for text in warned), warned
 
 
 def test_a_prior_on_a_background_that_is_not_its_own_is_not_metric(tmp_path):

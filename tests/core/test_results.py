@@ -44,7 +44,7 @@ def test_a_frame_is_what_the_pipeline_gave(unit, source, results):
     assert repr(result).startswith("Result(1 frame of 48 x 64 px, 0.6 mm per pixel, deepest 0.") and len(repr(result)) < 150
     for ours, theirs in zip(result, (out.depth_mm, out.normal, out.gradient, out.contact, out.deformed)):
         assert torch.equal(ours, theirs)
-    assert result[5:] == (PITCH, UNITS, "unit.safetensors", "rig", ["3.png"])
+    assert result[5:] == (PITCH, UNITS, "unit.safetensors", "rig", ["3.png"], True, [], [""])
     with np.load(results / "3.npz") as plain:  # without this package
         assert plain["depth_mm"].shape == (HEIGHT, WIDTH) and plain["normals"].shape == (3, HEIGHT, WIDTH)
         assert float(plain["mm_per_pixel"]) == PITCH and json.loads(str(plain["units"])) == UNITS
@@ -134,7 +134,7 @@ def damaged(path, tmp_path, how):
     "how, message",
     [
         (lambda a: a.pop("contact"), "it has no contact"),
-        (lambda a: a.update(format=np.asarray(2)), "it has layout 2, this version reads 1: update torchvts"),
+        (lambda a: a.update(format=np.asarray(3)), "it has layout 3, this version reads 2: update torchvts"),
         (lambda a: a.update(normals=a["normals"][:2]), r"normals: expected \(3, 48, 64\), float32, got \(2, 48, 64\)"),
         (
             lambda a: a.update(depth_mm=a["depth_mm"].astype("f8")),

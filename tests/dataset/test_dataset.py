@@ -113,7 +113,7 @@ def test_killed_processes_lose_nothing_and_the_next_run_goes_on(unit, frames, wh
     else:
         second = started(launcher, unit, frames, "--out", out)
         printed = second.communicate()[0]
-        assert second.returncode == 0, printed
+        assert second.returncode == 1 and "in doubt: 20 of 120 frames" in printed, printed  # the film is compressed
         assert "wrote 120 frames" in printed and "by an earlier run" in printed
     assert contents(out) == whole
 
@@ -225,8 +225,11 @@ def test_frames_in_another_light_are_named(unit, tmp_path):
     for k, name in enumerate(("a.png", "b.png", "c.png")):
         vts.write_image(tmp_path / "images" / name, tiny_image(k) * (off if k else 1.0))
     report = reconstruct_dataset(unit, tmp_path / "images", tmp_path / "out", pictures=False)
-    ((name, note),) = report.notes
-    assert name == "b.png" and "channel R is black" in note and "1 more frames are in doubt" in note and report.rows == 3
+    assert [name for name, _ in report.doubted] == ["b.png", "c.png"] and report.rows == 3
+    assert all("channel R is black" in doubt and "check the LEDs" in doubt for _, doubt in report.doubted)
+    assert vts.read_result(tmp_path / "out" / "b.npz").frame_doubts == [report.doubted[0][1]]
+    assert json.loads((tmp_path / "out" / "summary.json").read_text())["doubted_frames"] == 2
+    assert reconstruct_dataset(unit, tmp_path / "images", tmp_path / "out", pictures=False).doubted == report.doubted  # all done
     pictures = [bgr(tiny_image(-1 - k)) for k in range(14)] + [bgr(tiny_image(k) * (off if k > 3 else 1.0)) for k in range(8)]
     (tmp_path / "film").mkdir()
     write_film(tmp_path / "film" / "film.avi", pictures)
@@ -384,3 +387,31 @@ def test_folders_above_keep_results_within_and_files_come_once(tmp_path, monkeyp
     monkeypatch.chdir(tmp_path / "data" / "inner")
     assert [item.stem for item in list_items((Path(".."), Path("y.png"), Path(".")))] == ["data/inner/y", "data/x"]
     assert [item.stem for item in list_items((Path("."), Path("../x.png")))] == ["inner/y", "x"]
+
+
+def test_doubts_stand_in_every_output_and_not_metric_once_in_print(unit, tmp_path, run_script, monkeypatch):
+    calibration = vts.Calibration.load(unit)
+    doubt, unchecked = "background: it is odd: take it again", "not checked: no image shows the scale"
+    report = calibration.report | {"doubts": [doubt, unchecked], "not_metric": [doubt]}
+    calibration = vts.Calibration.from_lights(calibration.lights, calibration.sensor, calibration.background, report)
+    calibration.save(tmp_path / "odd.safetensors")
+    duller = 0.9 * tiny_image(30) + 0.1 * tiny_image(30).mean(0)  # a smaller saturation of the colours
+    vts.write_image(tmp_path / "a.png", duller)
+    done = run_script("reconstruct", tmp_path / "odd.safetensors", tmp_path / "a.png", "--out", tmp_path / "out")
+    assert done.returncode == 1 and done.stdout.count("NOT METRIC") == 1 and "(not in mm)" in done.stdout, done.stdout
+    assert done.stdout.count(doubt) == 1 and "in doubt: 1 of 1 frames" in done.stdout and ", IN DOUBT" in done.stdout
+    result = vts.read_result(tmp_path / "out" / "a.npz")
+    assert not result.metric and result.doubts == [doubt, unchecked] and "the light is not that" in result.frame_doubts[0]
+    assert "NOT METRIC" in repr(result) and "1 IN DOUBT" in repr(result)
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert (summary["metric"], summary["doubts"], summary["doubted_frames"]) == (False, [doubt, unchecked], 1)
+    assert result.frame_doubts[0] in (tmp_path / "out" / "frames.csv").read_text()
+    drawn = []
+    monkeypatch.setattr(viz, "save_figure", lambda figure, path: (drawn.append(figure), Path(path).touch()))
+    for cloud in ("ply", "pcd", "obj"):
+        reconstruct_dataset(tmp_path / "odd.safetensors", tmp_path / "a.png", tmp_path / cloud, cloud=cloud)
+        head = (tmp_path / cloud / f"a.{cloud}").read_bytes()[:500]
+        assert b"; NOT METRIC; IN DOUBT: the light is not that" in head
+    title, said = drawn[0].texts
+    assert title.get_text() == "a.png, NOT METRIC"
+    assert said.get_text().startswith(f"{doubt}\nIN DOUBT: the light is not") and unchecked not in said.get_text()

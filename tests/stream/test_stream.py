@@ -267,7 +267,7 @@ def test_a_step_of_the_light_is_in_the_table_and_a_dead_led_is_in_doubt(unit):
         lines = [report.add(frame)[0] for frame in stream]
     assert [float(row[4][0]) for row in report.rows[:50]] == pytest.approx([1.0] * 20 + [0.7] * 20 + [1.0] * 10, abs=0.01)
     assert ["IN DOUBT" in line for line in lines] == [False] * 50 + [True] * 5
-    assert "5 frames in doubt (see frames.csv), the first of them 50: channel R is black" in report.table()
+    assert "in doubt: 5 of 55 frames (column doubt of frames.csv), the first 50: channel R is black" in report.table()
     assert len([w for w in caught if "channel R is black" in str(w.message)]) == 1
 
 

@@ -13,7 +13,7 @@ from ..compensate.light import UNEVEN
 from ..core.arrays import array_of
 from ..core.views import Views
 from ..model.calibration import SATURATED, Calibration
-from ..model.report import Report
+from ..model.report import NOT_CHECKED, Report
 from ..model.response_field import ResponseField
 from ..model.sensor import Sensor
 from .by_lights import NOTHING_LEFT
@@ -54,9 +54,6 @@ SHIFTED = 0.15
 
 STANDING_OUT = 0.01
 """Share of a background that differs clearly from fitted lights, from which it may hold a contact."""
-
-NOT_CHECKED = "not checked"
-"""How the doubt begins that says what no image could show: it is no warning."""
 
 
 class CalibrationWarning(UserWarning):
@@ -248,13 +245,13 @@ def of_type(background: Tensor, sensor: Sensor) -> list[Doubt]:
     usual = sensor.prior.background(sensor.height, sensor.width, sensor.mm_per_pixel).float().clamp_min(1e-3)
     views = Views(array_of(usual))
     cells = views.cells(array_of(light * (usual.mean() / light.mean())))
-    seen = f"its pattern of light is not that of the unit on which the prior of sensor '{sensor.name}' was fitted"
     difference, view = views.difference(cells), views.other(cells)
     if view is not None and not (view.cropped and difference < SHIFTED):
         return [
             Doubt(
-                f"background: {seen}: it {view.in_words()}: turn, swap or crop the images as the sensor's are; where it "
-                "is cropped, mm_per_pixel may be wrong",
+                f"background: held against images of sensor '{sensor.name}' it {view.what} ({view.undone:.0%} off them with that "
+                f"undone, {view.same:.0%} as it is): turn, swap or crop the images as that sensor's are"
+                + (", else mm_per_pixel is wrong" if view.cropped else ""),
                 True,
             )
         ]
@@ -262,8 +259,9 @@ def of_type(background: Tensor, sensor: Sensor) -> list[Doubt]:
         return []
     return [
         Doubt(
-            f"background: {seen}: they differ by {difference:.0%} in the median, at most {SAME_TYPE:.0%} is usual, and no turned, "
-            "mirrored or channel-swapped one fits: another sensor type, or an LED failed: give presses of a ball",
+            f"background: its light is {difference:.0%} off that of sensor '{sensor.name}' in the median, at most {SAME_TYPE:.0%} "
+            "is usual, and it fits no better turned, mirrored or with channels swapped: another type of sensor, or an LED "
+            "has failed: give presses of a ball",
             True,
         )
     ]

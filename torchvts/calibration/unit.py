@@ -8,9 +8,10 @@ from torch import Tensor
 from ..core.checks import check_image, check_switch
 from ..core.threads import OneThread
 from ..model.calibration import Calibration
+from ..model.report import warnings_of
 from ..model.sensor import Sensor, check_sensor
 from .choose import Given, choose
-from .doubts import NOT_CHECKED, CalibrationWarning
+from .doubts import CalibrationWarning
 from .given_images import check_exposure, check_light, sort_presses
 from .presses import Press, check_presses
 
@@ -76,7 +77,6 @@ def calibrate(
     for k, reason in left_out:
         report["presses"].insert(k, {"name": named[k].name, "used": False, "reason": reason})
     report["doubts"] = [f"{named[k].name}: left out: {reason}" for k, reason in left_out] + report["doubts"]
-    for doubt in report["doubts"]:
-        if not doubt.startswith(NOT_CHECKED):
-            warnings.warn(doubt, CalibrationWarning, stacklevel=2)
+    for doubt in warnings_of(report):
+        warnings.warn(doubt, CalibrationWarning, stacklevel=2)
     return calibration

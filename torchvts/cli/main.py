@@ -35,7 +35,7 @@ COMMANDS = {
 
 FAILED, USAGE_OR_INPUT, BUG, INTERRUPTED = 1, 2, 70, 130
 """Exit statuses: nobody reads the output; a request or an input that cannot be used; a bug in torchvts; Ctrl-C. A subcommand
-returns 0, or 1 where it did its job and something is wrong with the images (frames left out, a fault found, a pose not found)."""
+returns 0, or 1 where it did its job and something is wrong with the images: frames left out or in doubt, a fault, no pose."""
 
 PACKAGE = f"{Path(__file__).parents[1]}{os.sep}"
 
@@ -62,8 +62,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     Args:
         argv: the words after ``torchvts``; None takes those of the process.
     Returns:
-        The exit status: 0; 1 where frames were left out or a fault was found; 2 for a wrong request or input; 70 for a bug; 130
-        after Ctrl-C.
+        The exit status: 0; 1 where frames were left out or in doubt, or a fault was found; 2 for a wrong request or input; 70 for
+        a bug; 130 after Ctrl-C.
     Example:
         >>> main(["--version"])  # doctest: +ELLIPSIS
         torchvts ...

@@ -166,4 +166,4 @@ def draw(
     if arguments.cloud != "none":
         for which, points in (("moved", source.double() @ T[:3, :3].T + T[:3, 3]), ("target", target)):
             path = arguments.out / f"{name}_{which}.{arguments.cloud}"
-            write_point_cloud(path, written.points(points), axes=written.axes)
+            write_point_cloud(path, written.points(points), text=written.axes)

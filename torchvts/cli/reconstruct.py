@@ -2,7 +2,7 @@
 
 The first of the files is the calibration that torchvts calibrate wrote. With --sensor in its place the unit is calibrated
 first: from --background and --press, or from the first frames of a video, which must be without contact.
-Exit status 1 where a frame was left out.
+Exit status 1 where a frame was left out or is in doubt.
 
 examples:
   torchvts reconstruct unit.safetensors press.png --out out/press
@@ -21,6 +21,8 @@ from tqdm import tqdm
 from ..core.files import VIDEO_SUFFIXES, make_folder, read_frames
 from ..dataset import CLOUD_FORMATS, FORMATS, PICTURES_UP_TO, Report, list_items, reconstruct_dataset
 from ..diagnose import Finding, diagnose
+from ..model import Calibration
+from ..model.report import warnings_of
 from ..stream import NOT_METRIC, read_background, read_press_images
 from .options import (
     add_background_frames,
@@ -34,7 +36,7 @@ from .options import (
     load_sensor,
 )
 from .parser import UsageError
-from .summary import SHOWN, calibrated, print_calibration
+from .summary import SHOWN, calibrated, print_calibration, print_doubts
 
 PASSED = (
     "mode", "format", "cloud", "length_unit", "pictures", "every", "network", "device", "background_frames", "batch", "workers",
@@ -80,15 +82,15 @@ def run(arguments: argparse.Namespace) -> int:
     if report.rank > 0:
         return 0
     unit = load_calibration(calibration)
-    print_report(report, arguments.out)
-    if not unit.metric:
-        print(f"{NOT_METRIC}: {'; '.join(unit.report['not_metric'])}")
+    print_report(report, arguments.out, unit.metric)
+    if arguments.sensor is None:  # else said where it was calibrated
+        print_unit(unit)
     if arguments.pictures is None and report.rows > PICTURES_UP_TO:
         print(f"no pictures of more than {PICTURES_UP_TO} frames: --pictures --overwrite draws all, --every N fewer")
-    findings = diagnose_some(calibration, inputs, {name for name, _ in report.failed}, arguments.every)
+    findings = diagnose_some(unit, inputs, report, arguments.every)
     for name, finding in findings:
         print(f"{name}: {finding}")
-    return 1 if report.failed or any(finding.severity == "fault" for _, finding in findings) else 0
+    return 1 if report.failed or report.doubted or any(finding.severity == "fault" for _, finding in findings) else 0
 
 
 def split_files(arguments: argparse.Namespace) -> tuple[Path | None, list[Path]]:
@@ -123,38 +125,51 @@ def calibrate_first(arguments: argparse.Namespace, inputs: list[Path]) -> Path:
     return path
 
 
-def print_report(report: Report, out: Path) -> None:
-    """Print the deepest frames, how many were left out, and where the results are."""
+def print_unit(unit: Calibration) -> None:
+    """Print why not to trust a calibration that was given."""
+    if not unit.metric:
+        print(NOT_METRIC)
+    if warnings_of(unit.report):
+        print_doubts(unit.report)
+
+
+def print_report(report: Report, out: Path, metric: bool) -> None:
+    """Print the deepest frames, how many were left out, which are in doubt, and where the results are."""
     with (out / "frames.csv").open(encoding="utf-8", errors="replace", newline="") as stream:
         rows = list(csv.DictReader(stream))
     rows.sort(key=lambda row: -float(row["deepest_mm"]))
     shown = rows[:SHOWN]
     for row in shown:
-        print(f"{row['frame']}: deepest {float(row['deepest_mm']):.3f} mm, contact {float(row['contact_mm2']):.2f} mm2")
+        depth = f"deepest {float(row['deepest_mm']):.3f} {'mm' if metric else '(not in mm)'}"
+        doubt = ", IN DOUBT" if row["doubt"] else ""
+        print(f"{row['frame']}: {depth}, contact {float(row['contact_mm2']):.2f} mm2{doubt}")
     if len(rows) > SHOWN:
         print(f"... the deepest {SHOWN} of {len(rows)}; contact in {sum(float(row['contact_mm2']) > 0 for row in rows)}")
     for name, note in report.notes:
         print(f"{name}: {note}")
     if report.failed:
         print(f"{len(report.failed)} left out, all of them in {out / 'failed.csv'}")
+    if report.doubted:
+        name, doubt = report.doubted[0]
+        print(f"in doubt: {len(report.doubted)} of {report.rows} frames (column doubt of frames.csv), the first {name}: {doubt}")
     before = f", {report.before} of them by an earlier run" if report.before else ""
     frames = f"{report.rows} frame{'s' if report.rows != 1 else ''}"
     print(f"wrote {frames} to {out}{before}; table in frames.csv, units in summary.json")
 
 
-def diagnose_some(calibration: Path, inputs: list[Path], reported: set[str], every: int) -> list[tuple[str, Finding]]:
-    """What is wrong with :data:`DIAGNOSED` images, and the first frame of each video; frames in ``reported`` are not.
+def diagnose_some(unit: Calibration, inputs: list[Path], report: Report, every: int) -> list[tuple[str, Finding]]:
+    """What is wrong with :data:`DIAGNOSED` images, and the first frame of each video; frames that were left out are not asked.
 
-    A finding is given once, with its first frame and how many more have it.
+    A finding is given once, with its first frame and how many more have it. Of a frame in doubt only faults are given.
     """
-    unit = load_calibration(calibration)
+    left_out, doubted = ({name for name, _ in rows} for rows in (report.failed, report.doubted))
     items = list(list_items(tuple(inputs) if len(inputs) > 1 else inputs[0], every))
     if len(items) > DIAGNOSED:
         items = list({item.file.parent: item for item in reversed(items)}.values())[::-1][:DIAGNOSED]
     found: dict[str, list[tuple[str, Finding]]] = {}
     for item in tqdm(items, desc="diagnosing", leave=False, disable=None):
         name = item.frame_name(0 if item.is_video else -1)
-        if name in reported:
+        if name in left_out:
             continue
         try:
             _, raw = next(iter(read_frames(item.file)))
@@ -162,6 +177,6 @@ def diagnose_some(calibration: Path, inputs: list[Path], reported: set[str], eve
         except (OSError, ValueError, StopIteration):  # named where it was to be reconstructed
             continue
         for finding in diagnose(None, image, unit):
-            if finding.severity != "note":
+            if finding.severity == "fault" or (finding.severity == "warning" and name not in doubted):
                 found.setdefault(finding.name, []).append((name, finding))
     return [(same[0][0] + (f" and {len(same) - 1} more" if len(same) > 1 else ""), same[0][1]) for same in found.values()]

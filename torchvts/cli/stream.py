@@ -1,6 +1,7 @@
 """Depth of a camera or a recording, frame by frame, into files; late frames of a camera are dropped. torchvts view shows it live.
 
-The first frames must be without contact. Ctrl-C ends it and finishes the files. Exit status 1 where a frame was left out.
+The first frames must be without contact. Ctrl-C ends it and finishes the files. Exit status 1 where a frame was left out
+or is in doubt.
 
 examples:
   torchvts stream --source 0 --sensor gelsight_mini
@@ -89,7 +90,7 @@ def run(arguments: argparse.Namespace) -> int:
         print(f"wrote {len(report.rows)} frames to {arguments.out}")
     if lost is not None:
         raise lost
-    return 1 if stream.left_out else 0
+    return 1 if stream.left_out or report.doubted else 0
 
 
 class _Files:

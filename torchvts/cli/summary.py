@@ -7,11 +7,10 @@ from collections.abc import Iterator, Sequence
 from torch import Tensor
 
 from ..calibration import CalibrationWarning, Press, calibrate
-from ..calibration.doubts import NOT_CHECKED
 from ..core.tables import markdown, number
 from ..diagnose.checks import SATURATED_SHARE
 from ..model import Calibration, PointLights, Sensor
-from ..model.report import PressRow, Report
+from ..model.report import NOT_CHECKED, PressRow, Report
 from ..model.stated_error import UNKNOWN_DEG, press_next
 from ..stream import NOT_METRIC
 
@@ -51,9 +50,7 @@ def print_calibration(calibration: Calibration, candidates: bool = False) -> Non
     saturated = float((calibration.background >= calibration.saturation_light).any(0).double().mean())
     if saturated > SATURATED_SHARE:
         print(f"saturated: {saturated:.0%} of the background: depth is worse there; reduce the exposure and calibrate again")
-    for doubt in report["doubts"]:
-        if doubt.startswith(NOT_CHECKED):
-            print(doubt)
+    print_doubts(report)
     for line in left_out("press", [(row["name"], row.get("reason", "")) for row in report.get("presses", []) if not row["used"]]):
         print(line)
     if candidates:
@@ -64,14 +61,21 @@ def print_calibration(calibration: Calibration, candidates: bool = False) -> Non
             print_presses(report["presses"])
 
 
+def print_doubts(report: Report) -> None:
+    """Print why not to trust a calibration, a line each; presses that were left out are named elsewhere."""
+    presses = tuple(f"{row['name']}: left out" for row in report.get("presses", []) if not row["used"])
+    for doubt in report.get("doubts", []):
+        if not doubt.startswith(presses):
+            print(doubt if doubt.startswith(NOT_CHECKED) else f"doubt: {doubt}")
+
+
 def calibrated(background: Tensor, sensor: Sensor, presses: Sequence[Press], force: bool = False) -> Calibration:
-    """:func:`torchvts.calibrate`; warnings become lines on stderr, save those about presses that the summary names."""
+    """:func:`torchvts.calibrate`; warnings become lines on stderr, save the doubts, which the summary prints."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", CalibrationWarning)
         calibration = calibrate(background, sensor, presses, progress=True, force=force)
-    named = tuple(f"{row['name']}: left out" for row in calibration.report.get("presses", []) if not row["used"])
-    for text in dict.fromkeys(" ".join(str(warning.message).split()) for warning in caught):
-        if not text.startswith(named):
+    for text in dict.fromkeys(str(warning.message) for warning in caught):
+        if text not in calibration.report.get("doubts", []):
             print(f"torchvts: warning: {text}", file=sys.stderr)
     return calibration
 
@@ -79,8 +83,8 @@ def calibrated(background: Tensor, sensor: Sensor, presses: Sequence[Press], for
 def expected(calibration: Calibration) -> str:
     """How good depth is likely to be, from the held-out score, the record of the prior, or the spread of the lights."""
     report = calibration.report
-    if doubts := report.get("not_metric"):
-        return f"{NOT_METRIC}: {'; '.join(doubts)}"
+    if not calibration.metric:
+        return f"{NOT_METRIC}: see the doubts below"
     if report["model"] == "point_lights":
         spread = report.get("direction_std_deg")
         if spread is None:

@@ -13,7 +13,7 @@ examples:
 import argparse
 from pathlib import Path
 
-from ..core.results import write_result
+from ..core.results import Facts, write_result
 from ..stream import Keys, LiveView, StreamReport, TactileFrame, TactileStream, has_screen, require_rerun
 from ..stream.view import EXAGGERATION
 from ..viz import depth_figure, save_figure
@@ -86,9 +86,12 @@ class _Viewing:
         """Write the frame as npz and as a picture."""
         self.out.mkdir(parents=True, exist_ok=True)
         path, sensor = self.out / f"frame_{frame.number:06}.npz", self.stream.calibration.sensor
-        write_result(path, frame.output, sensor.mm_per_pixel, "", sensor.name, str(frame.number))
-        title = f"{sensor.name}, {frame.time_s:.2f} s" + ("" if self.stream.metric else ", NOT METRIC")
-        figure = depth_figure(frame.output.depth_mm, sensor.mm_per_pixel, frame.image, frame.output.contact, title)
+        metric, doubts, doubt = self.stream.metric, self.stream.calibration.report.get("doubts", []), self.stream.doubt
+        write_result(path, frame.output, Facts(sensor.mm_per_pixel, "", sensor.name, metric, doubts), str(frame.number), doubt)
+        title, said = f"{sensor.name}, {frame.time_s:.2f} s", [f"IN DOUBT: {doubt}"] if doubt else []
+        figure = depth_figure(
+            frame.output.depth_mm, sensor.mm_per_pixel, frame.image, frame.output.contact, title, metric=metric, doubts=said
+        )
         save_figure(figure, path.with_suffix(".png"))
         print(f"wrote {path} and .png")
 

@@ -23,13 +23,19 @@ UNITS = {
     "contact": "where the object touches the skin",
     "deformed": "where the skin has moved",
     "mm_per_pixel": "mm",
+    "metric": "whether lengths are in mm: the calibration does not doubt its scale",
+    "doubts": "why not to trust the calibration, a sentence each",
+    "frame_doubts": "of each frame, why less may have been seen than is there; empty for nothing",
 }
 """What the arrays of a result file are; the file carries it."""
 
 MAPS = {"depth_mm": (1, "f4"), "normals": (3, "f4"), "gradient": (2, "f4"), "contact": (1, "?"), "deformed": (1, "?")}
 """Channels and type of each array: (B, channels, H, W) in a :class:`Result`; in a file (H, W) where there is one channel."""
 
-FORMAT = 1
+PER_FRAME = ("frames", "frame_doubts")
+"""Texts of which each frame has one."""
+
+FORMAT = 2
 """Version of the layout."""
 
 MOST_PACKED = 1100
@@ -50,6 +56,9 @@ class Result(NamedTuple):
         calibration: file name of the calibration.
         sensor: name of the sensor.
         frames: name of each frame.
+        metric: whether lengths are in mm: its calibration does not doubt its scale.
+        doubts: why not to trust the calibration, a sentence each.
+        frame_doubts: of each frame, why less may have been seen than is there; "" for nothing.
     """
 
     depth_mm: Tensor
@@ -62,34 +71,55 @@ class Result(NamedTuple):
     calibration: str
     sensor: str
     frames: Sequence[str]
+    metric: bool
+    doubts: Sequence[str]
+    frame_doubts: Sequence[str]
 
     def __repr__(self) -> str:
         count, _, height, width = self.depth_mm.shape
         size = f"{count} frame{'s' if count != 1 else ''} of {height} x {width} px, {self.mm_per_pixel:g} mm per pixel"
-        deepest = f"deepest {float(self.depth_mm.max()):.3f} mm"
-        return f"Result({size}, {deepest}, sensor {self.sensor!r}, calibration {self.calibration!r})"
+        deepest = f"deepest {float(self.depth_mm.max()):.3f} mm{'' if self.metric else ', NOT METRIC'}"
+        doubted = sum(doubt != "" for doubt in self.frame_doubts)
+        doubt = f", {doubted} IN DOUBT" if doubted else ""
+        return f"Result({size}, {deepest}{doubt}, sensor {self.sensor!r}, calibration {self.calibration!r})"
 
 
-def write_result(path: str | Path, output: DepthOutput, mm_per_pixel: float, calibration: str, sensor: str, frame: str) -> None:
+class Facts(NamedTuple):
+    """What a result file says beside the maps of a frame.
+
+    Attributes:
+        mm_per_pixel: pitch, mm.
+        calibration: file name of the calibration.
+        sensor: name of the sensor.
+        metric: whether lengths are in mm.
+        doubts: of the calibration, a sentence each.
+    """
+
+    mm_per_pixel: float
+    calibration: str
+    sensor: str
+    metric: bool = True
+    doubts: Sequence[str] = ()
+
+
+def write_result(path: str | Path, output: DepthOutput, facts: Facts, frame: str, doubt: str = "") -> None:
     """Write one frame as npz, compressed; the same values give the same bytes.
 
     Args:
         path: the file, ending in .npz.
         output: of the pipeline, of one frame.
-        mm_per_pixel: pitch, mm.
-        calibration: file name of the calibration.
-        sensor: name of the sensor.
+        facts: of the unit that it is from.
         frame: name of the frame.
+        doubt: why less may have been seen in it than is there; "" for nothing.
     """
     maps = zip(MAPS, (output.depth_mm, output.normal, output.gradient, output.contact, output.deformed))
     arrays = {name: values[0].detach().cpu().numpy().astype(MAPS[name][1]) for name, values in maps}
     arrays = {name: values[0] if MAPS[name][0] == 1 else values for name, values in arrays.items()}
-    facts = {"mm_per_pixel": np.float64(mm_per_pixel), "frames": np.array([frame])}
-    texts = {"calibration": calibration, "sensor": sensor, "units": json.dumps(UNITS)}
+    given = facts._replace(doubts=np.array(facts.doubts, dtype=np.str_))._asdict()  # type: ignore[arg-type]
+    own = {"frames": [frame], "frame_doubts": [doubt], "units": json.dumps(UNITS), "format": FORMAT}
     with write_atomically(path) as temporary, _archive(temporary) as archive:
-        for name, values in {**arrays, **facts, **{name: np.array(text) for name, text in texts.items()}}.items():
+        for name, values in {**arrays, **given, **own}.items():
             _write_array(archive, name, [np.asarray(values)], None)
-        _write_array(archive, "format", [np.asarray(FORMAT)], None)
 
 
 def join_results(path: str | Path, parts: Sequence[Path]) -> None:
@@ -101,10 +131,11 @@ def join_results(path: str | Path, parts: Sequence[Path]) -> None:
     """
     with write_atomically(path) as temporary, _archive(temporary) as archive:
         with np.load(parts[0]) as first:
-            shared = {name: first[name] for name in ("mm_per_pixel", "calibration", "sensor", "units", "format")}
+            shared = {name: first[name] for name in (*Facts._fields, "units", "format")}
         for name, values in shared.items():
             _write_array(archive, name, [values], None)
-        _write_array(archive, "frames", [np.concatenate([_part(part, "frames") for part in parts])], None)
+        for name in PER_FRAME:
+            _write_array(archive, name, [np.concatenate([_part(part, name) for part in parts])], None)
         for name in MAPS:
             _write_array(archive, name, (_part(part, name) for part in parts), len(parts))
 
@@ -143,10 +174,10 @@ def read_result(path: str | Path) -> Result:
         >>> flat, mask = torch.zeros(1, 1, 4, 6), torch.zeros(1, 1, 4, 6, dtype=torch.bool)
         >>> output = DepthOutput(flat, flat.expand(1, 2, 4, 6), torch.ones(1, 3, 4, 6), mask, mask)
         >>> with tempfile.TemporaryDirectory() as folder:
-        ...     write_result(f"{folder}/0.npz", output, 0.05, "unit.safetensors", "rig", "0.png")
+        ...     write_result(f"{folder}/0.npz", output, Facts(0.05, "unit.safetensors", "rig"), "0.png")
         ...     result = read_result(f"{folder}/0.npz")
-        >>> result.depth_mm.shape, result.mm_per_pixel, result.frames
-        (torch.Size([1, 1, 4, 6]), 0.05, ['0.png'])
+        >>> result.depth_mm.shape, result.mm_per_pixel, result.frames, result.metric
+        (torch.Size([1, 1, 4, 6]), 0.05, ['0.png'], True)
     """
     path = check_path("path", path)
     if not path.is_file():
@@ -172,9 +203,9 @@ def _array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> Array:
 
 
 def _result(stored: Mapping[str, Array]) -> Result:
-    missing = [name for name in (*MAPS, "mm_per_pixel", "units", "calibration", "sensor", "frames") if name not in stored]
+    missing = [name for name in (*MAPS, *Facts._fields, *PER_FRAME, "units") if name not in stored]
     if missing:
-        raise ValueError(f"it has no {', '.join(missing)}")
+        raise ValueError(f"it has no {', '.join(missing)}: of another torchvts? reconstruct again")
     if int(stored.get("format", np.asarray(FORMAT))) > FORMAT:
         raise ValueError(f"it has layout {int(stored['format'])}, this version reads {FORMAT}: update torchvts")
     frames = [str(name) for name in stored["frames"]]
@@ -194,4 +225,7 @@ def _result(stored: Mapping[str, Array]) -> Result:
         calibration=str(stored["calibration"]),
         sensor=str(stored["sensor"]),
         frames=frames,
+        metric=bool(stored["metric"]),
+        doubts=[str(doubt) for doubt in stored["doubts"]],
+        frame_doubts=[str(doubt) for doubt in stored["frame_doubts"]],
     )

@@ -55,11 +55,9 @@ class OtherView(NamedTuple):
         return "cropped" in self.what
 
     def in_words(self) -> str:
-        """Such as "is turned by 180 degrees: with that undone it differs from the background by 2%, else by 31%"."""
+        """Such as "is turned by 180 degrees (2% off the background with that undone, 31% as it is)"."""
         or_light = ", or its light has changed, or an object covers most of it" if self.cropped else ""
-        return (
-            f"{self.what}{or_light}: with that undone it differs from the background by {self.undone:.0%}, else by {self.same:.0%}"
-        )
+        return f"{self.what}{or_light} ({self.undone:.0%} off the background with that undone, {self.same:.0%} as it is)"
 
 
 class Views:

@@ -53,7 +53,8 @@ class Report(NamedTuple):
         before: how many of them an earlier run had done.
         failed: (name, reason) of the frames that were left out.
         seconds: from the first frame until all processes had finished.
-        notes: (name, text) of what else is to be known: videos whose first frames were not used, frames in another light.
+        notes: (name, text) of what else is to be known: videos whose first frames were not used, or that are cut short.
+        doubted: (name, doubt) of the frames in which less may have been seen than is there.
     """
 
     rank: int
@@ -62,6 +63,7 @@ class Report(NamedTuple):
     failed: list[tuple[str, str]]
     seconds: float
     notes: Sequence[tuple[str, str]] = ()
+    doubted: Sequence[tuple[str, str]] = ()
 
 
 def reconstruct_dataset(
@@ -203,14 +205,13 @@ class _Worker:
         self, unit: Calibration, name: str, network: str | Path | None, records: Records, share: tuple[int, int], strict: bool
     ) -> None:
         self.unit, self.records, self.settings, self.share, self.strict = unit, records, records.settings, share, strict
-        self.sensor, self.writer = unit.sensor, Writer(records, unit.sensor, name, unit.metric)
+        self.sensor, self.writer = unit.sensor, Writer(records, unit, name)
         thresholds = None if self.settings.contact is None else ContactSettings(**self.settings.contact)
         self.recording = partial(
             Recording, unit, self.settings.mode, network=network, device=self.settings.device, contact=thresholds
         )
         self.image = self.recording()
         self.notes: list[tuple[str, str]] = []
-        self.doubted: list[tuple[str, str]] = []
         self.done = self.failed = 0
 
     def run(self, batch: int, workers: int | None) -> Report:
@@ -238,14 +239,10 @@ class _Worker:
         seconds = time.perf_counter() - start
         if rank > 0:
             return Report(rank, 0, 0, [], seconds)
-        if self.doubted:
-            name, doubt = self.doubted[0]
-            more = f" (and {len(self.doubted) - 1} more frames are in doubt)" if len(self.doubted) > 1 else ""
-            self.notes.append((name, f"{doubt}{more}"))
         self.records.join_videos()
-        rows, failed = self.records.write_tables()
-        self.writer.write_summary(rows, len(failed))
-        return Report(0, rows, rows - done, failed, seconds, self.notes)
+        rows, failed, doubted = self.records.write_tables()
+        self.writer.write_summary(rows, len(failed), len(doubted))
+        return Report(0, rows, rows - done, failed, seconds, self.notes, doubted)
 
     def _depths(self, loaded: Iterable[tuple[Frame, Tensor | None]]) -> Iterator[_Reconstructed]:
         """The frames of this rank with image and depth; those of a video once its first frames are there."""
@@ -298,8 +295,6 @@ class _Worker:
             if frame.done:
                 return frame, None, None
             output = recording(image)
-            if recording.doubt:
-                self.doubted.append((frame.item.frame_name(frame.number), recording.doubt))
             return frame._replace(doubt=recording.doubt), image, output
         except ValueError as error:
             return frame._replace(failed=in_one_line(error)), None, None

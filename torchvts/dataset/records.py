@@ -237,16 +237,17 @@ class Records:
             frames = range(0, length, self.settings.every)
         return ((item.frame_name(frame), self.read(item, frame)) for frame in frames)
 
-    def write_tables(self) -> tuple[int, list[tuple[str, str]]]:
+    def write_tables(self) -> tuple[int, list[tuple[str, str]], list[tuple[str, str]]]:
         """Write frames.csv, and failed.csv where frames were left out.
 
         Returns:
-            Number of rows of frames.csv, and (name, reason) of the frames that were left out.
+            Number of rows of frames.csv; (name, reason) of the frames that were left out; (name, doubt) of those in doubt.
         Raises:
             RuntimeError: frames without a record, which a process that died was to do.
         """
         count = 0
         failed: list[tuple[str, str]] = []
+        doubted: list[tuple[str, str]] = []
         missing: list[str] = []
 
         def rows() -> Iterator[tuple[str, ...]]:
@@ -259,6 +260,8 @@ class Records:
                         failed.append((name, record["failed"]))
                     else:
                         count += 1
+                        if record["doubt"]:
+                            doubted.append((name, record["doubt"]))
                         yield name, f"{record['deepest_mm']:.6f}", f"{record['contact_mm2']:.6f}", record["doubt"]
             if missing:
                 raise RuntimeError(f"{len(missing)} frames have no result, the first is {missing[0]}: run the same command again")
@@ -268,7 +271,7 @@ class Records:
             _write_csv(self.out / "failed.csv", ("frame", "reason"), failed)
         else:
             (self.out / "failed.csv").unlink(missing_ok=True)
-        return count, failed
+        return count, failed, doubted
 
 
 def _size(path: str) -> int:

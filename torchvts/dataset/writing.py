@@ -10,8 +10,9 @@ from torch import Tensor
 from ..core import __version__
 from ..core.files import DEPTH_PNG_STEP_MM, DEPTH_PNG_ZERO, write_atomically, write_depth_png
 from ..core.geometry import depth_to_points
-from ..core.results import UNITS, write_result
-from ..model import Sensor
+from ..core.results import UNITS, Facts, write_result
+from ..model import Calibration
+from ..model.report import warnings_of
 from ..pipeline import DepthOutput
 from ..pose import OutputFrame, write_point_cloud
 from ..pose.surface_files import write_obj
@@ -20,11 +21,13 @@ from .records import VIDEO_FORMAT, Records
 
 
 class Writer:
-    """Writes the results of a run; ``name`` is that of its calibration, ``metric`` whether its depth is in mm."""
+    """Writes the results of a run by a calibration, whose file has this name."""
 
-    def __init__(self, records: Records, sensor: Sensor, name: str, metric: bool) -> None:
-        self.records, self.settings, self.sensor, self.name, self.metric = records, records.settings, sensor, name, metric
-        self.frame = OutputFrame(records.settings.length_unit, sensor)
+    def __init__(self, records: Records, unit: Calibration, name: str) -> None:
+        self.records, self.settings, self.sensor = records, records.settings, unit.sensor
+        self.facts = Facts(unit.sensor.mm_per_pixel, name, unit.sensor.name, unit.metric, unit.report.get("doubts", []))
+        self.warnings = warnings_of(unit.report)
+        self.frame = OutputFrame(records.settings.length_unit, unit.sensor)
         self.exaggeration: float | None = None  # of heights in all pictures, known from the first contact on
 
     def write(self, frame: Frame, image: Tensor, result: DepthOutput) -> None:
@@ -36,42 +39,44 @@ class Writer:
         if self.settings.format == VIDEO_FORMAT and frame.number >= 0:  # what an earlier run joined is of other frames
             (self.records.out / f"{frame.item.stem}.npz").unlink(missing_ok=True)
         if path.suffix == ".npz":
-            write_result(path, result, pitch, self.name, self.sensor.name, name)
+            write_result(path, result, self.facts, name, frame.doubt)
         elif path.suffix == ".png":
             write_depth_png(path, result.depth_mm)
         elif path.suffix == ".npy":
             with write_atomically(path) as temporary:
                 np.save(temporary, result.depth_mm[0, 0].numpy())
         if self.settings.cloud != "none" and bool(result.contact.any()):
-            self._write_contact(Path(f"{stem}.{self.settings.cloud}"), result)
+            self._write_contact(Path(f"{stem}.{self.settings.cloud}"), result, frame.doubt)
         if self.settings.pictures:
             from .. import viz
 
             if self.exaggeration is None and bool(result.contact.any()):
                 self.exaggeration = viz.exaggeration_of(float(result.depth_mm.max()), pitch * result.depth_mm.shape[3])
-            figure = viz.depth_figure(result.depth_mm, pitch, image, result.contact, name, self.exaggeration)
+            doubts = [*self.warnings, *([f"IN DOUBT: {frame.doubt}"] if frame.doubt else [])]
+            figure = viz.depth_figure(
+                result.depth_mm, pitch, image, result.contact, name, self.exaggeration, self.facts.metric, doubts
+            )
             viz.save_figure(figure, f"{stem}_picture.png")
 
-    def _write_contact(self, path: Path, result: DepthOutput) -> None:
-        """The contact as points or as a surface."""
+    def _write_contact(self, path: Path, result: DepthOutput, doubt: str) -> None:
+        """The contact as points or as a surface; a comment of the file says what is in doubt."""
         pitch = self.sensor.mm_per_pixel
+        text = self.frame.axes + ("" if self.facts.metric else "; NOT METRIC") + (f"; IN DOUBT: {doubt}" if doubt else "")
         if path.suffix == ".obj":
-            write_obj(path, result.depth_mm, result.normal, result.contact, pitch, self.frame)
+            write_obj(path, result.depth_mm, result.normal, result.contact, pitch, self.frame, text)
             return
         normals = result.normal[0].permute(1, 2, 0)[result.contact[0, 0]] * torch.tensor([1.0, -1.0, 1.0])  # y up
         points = self.frame.points(depth_to_points(result.depth_mm, pitch, result.contact))
-        write_point_cloud(path, points, self.frame.directions(normals), self.frame.axes)
+        write_point_cloud(path, points, self.frame.directions(normals), text)
 
-    def write_summary(self, rows: int, failed: int) -> None:
+    def write_summary(self, rows: int, failed: int, doubted: int) -> None:
         """summary.json: what the files are, so that they can be read without this package."""
         settings = self.settings
         summary = {
             "frames": rows,
             "left_out": failed,
-            "calibration": self.name,
-            "sensor": self.sensor.name,
-            "metric": self.metric,
-            "mm_per_pixel": self.sensor.mm_per_pixel,
+            "doubted_frames": doubted,
+            **self.facts._asdict(),
             "height": self.sensor.height,
             "width": self.sensor.width,
             "mode": settings.mode,

@@ -4,6 +4,9 @@ from typing import Any, Literal, TypedDict, cast, get_args
 
 from ..core.checks import brief
 
+NOT_CHECKED = "not checked"
+"""How the doubt begins that says what no image could show: it is no warning."""
+
 Model = Literal["point_lights", "response"]
 
 Source = Literal["given", "sensor_file", "background", "prior", "presses", "stand_in"]
@@ -117,6 +120,11 @@ class Report(_ReportKeys, total=False):
     gloss: list[float]
     residual_std: list[float]
     camera_height_mm: float
+
+
+def warnings_of(report: Report) -> list[str]:
+    """The doubts of a calibration that are to be said with every result: all but what nothing could check."""
+    return [doubt for doubt in report.get("doubts", []) if not doubt.startswith(NOT_CHECKED)]
 
 
 def read_report(values: Any, source: str) -> Report:

@@ -12,6 +12,12 @@ from .depth import DepthPipeline
 MOST = 3.0
 """Change of a channel's light, as a factor, that automatic exposure and white balance make at most."""
 
+REMEDY = (
+    "check the LEDs and the exposure, set gamma, saturation and white balance of the camera as at calibration, record without "
+    "loss, leave skin free, or calibrate again"
+)
+"""What to do about a frame in doubt."""
+
 LOST_SHARE = 0.5
 """Share of a channel that is black or saturated from which it is said."""
 
@@ -38,7 +44,7 @@ def usual_unseen_deg(calibration: Calibration, pipe: DepthPipeline) -> float:
 
 
 def doubts_of(conditions: Conditions, usual_deg: float) -> list[str]:
-    """For each frame why less may have been seen than is there, or ""."""
+    """For each frame why less may have been seen than is there, and what to do about it, or ""."""
     texts = []
     levels, unevenness = light_levels(conditions), light_unevenness(conditions)
     for level, uneven, lost, unseen in zip(levels, unevenness, conditions.lost, conditions.unseen_deg, strict=True):
@@ -48,18 +54,20 @@ def doubts_of(conditions: Conditions, usual_deg: float) -> list[str]:
             if float(share) > LOST_SHARE
         ]
         parts += [
-            f"channel {name} has {float(one):.0%} of its light" for name, one in zip("RGB", level) if not 1.0 / MOST < one < MOST
+            f"channel {name} has {float(one):.0%} of its light at calibration"
+            for name, one in zip("RGB", level)
+            if not 1.0 / MOST < one < MOST
         ]
         if float(unseen) > UNSEEN_DEG:
             parts.append(
-                f"the least changed skin scatters {float(unseen) / usual_deg:.0f} times as much as at calibration: slopes below "
-                f"{float(unseen):.0f} degrees could not be seen"
+                f"skin without contact looks {float(unseen) / usual_deg:.0f} times as rough as at calibration: slopes below "
+                f"{float(unseen):.0f} degrees could not be seen, and depth is too low"
             )
         if float(uneven.max()) > UNEVEN:
             each = ", ".join(f"{name} {float(one):.0%} +- {float(off):.0%}" for name, one, off in zip("RGB", level, uneven))
             parts.append(
-                f"the light is not that of the background ({each}, uneven): gamma, saturation, an LED, another unit, or a "
-                "contact over all of the skin?"
+                f"the light is not that of the background, nor a smooth change of it ({each}, uneven; or a "
+                "contact over all of the skin)"
             )
-        texts.append("; ".join(parts))
+        texts.append(f"{'; '.join(parts)}: {REMEDY}" if parts else "")
     return texts

@@ -83,14 +83,14 @@ def voxel_first(points: Tensor, size: float) -> Tensor:
     return torch.from_numpy(np.sort(np.unique(code.numpy(), return_index=True)[1]))
 
 
-def write_point_cloud(path: str | Path, points: Tensor, normals: Tensor | None = None, axes: str = SENSOR_AXES) -> None:
+def write_point_cloud(path: str | Path, points: Tensor, normals: Tensor | None = None, text: str = SENSOR_AXES) -> None:
     """Write a point cloud as .pcd or .ply, whole or not at all.
 
     Args:
         path: the file.
         points: (N, 3), in general mm, right-handed (see :func:`torchvts.depth_to_points`).
         normals: (N, 3), or None.
-        axes: unit and axes of the points in words, one line, which a .ply says.
+        text: comment of the file, one line: unit and axes of the points, and what is in doubt.
     Raises:
         ValueError: wrong shape, no points, values not finite, or another suffix.
     """
@@ -99,9 +99,9 @@ def write_point_cloud(path: str | Path, points: Tensor, normals: Tensor | None =
         raise ValueError(f"{path}: expected a name ending in {' or '.join(CLOUD_SUFFIXES)}, got {path.suffix!r}")
     places, directions = _array("points", points, None), None if normals is None else _array("normals", normals, len(points))
     if path.suffix.lower() == ".ply":
-        write_ply(path, places, directions, axes)
+        write_ply(path, places, directions, text)
     else:
-        write_pcd(path, places, directions)
+        write_pcd(path, places, directions, text)
 
 
 def read_point_cloud(path: str | Path) -> tuple[Tensor, Tensor | None]:

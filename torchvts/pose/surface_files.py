@@ -14,26 +14,28 @@ from .output_frame import OutputFrame
 Array = np.ndarray[Any, Any]
 
 
-def write_ply(path: Path, points: Array, normals: Array | None, axes: str) -> None:
+def write_ply(path: Path, points: Array, normals: Array | None, text: str) -> None:
     """Points (N, 3) and normals (N, 3) as binary PLY, float64."""
     columns = [points] if normals is None else [points, normals]
     names = ("x", "y", "z", "nx", "ny", "nz")[: 3 * len(columns)]
-    head = ["ply", "format binary_little_endian 1.0", f"comment {axes}", f"element vertex {len(points)}"]
+    head = ["ply", "format binary_little_endian 1.0", f"comment {text}", f"element vertex {len(points)}"]
     head += [*(f"property double {name}" for name in names), "end_header", ""]
     _write(path, "\n".join(head).encode() + np.hstack(columns).astype("<f8").tobytes())
 
 
-def write_pcd(path: Path, points: Array, normals: Array | None) -> None:
+def write_pcd(path: Path, points: Array, normals: Array | None, text: str) -> None:
     """Points (N, 3) and normals (N, 3) as binary PCD, float32."""
     columns = [points] if normals is None else [points, normals]
     names = ("x", "y", "z", "normal_x", "normal_y", "normal_z")[: 3 * len(columns)]
-    head = ["# .PCD v0.7 - Point Cloud Data file format", "VERSION 0.7", f"FIELDS {' '.join(names)}"]
+    head = ["# .PCD v0.7 - Point Cloud Data file format", f"# {text}", "VERSION 0.7", f"FIELDS {' '.join(names)}"]
     head += [f"{key} {' '.join(value * len(names))}" for key, value in (("SIZE", ["4"]), ("TYPE", ["F"]), ("COUNT", ["1"]))]
     head += [f"WIDTH {len(points)}", "HEIGHT 1", "VIEWPOINT 0 0 0 1 0 0 0", f"POINTS {len(points)}", "DATA binary", ""]
     _write(path, "\n".join(head).encode() + np.hstack(columns).astype("<f4").tobytes())
 
 
-def write_obj(path: Path, depth_mm: Tensor, normal: Tensor, contact: Tensor, mm_per_pixel: float, frame: OutputFrame) -> None:
+def write_obj(
+    path: Path, depth_mm: Tensor, normal: Tensor, contact: Tensor, mm_per_pixel: float, frame: OutputFrame, text: str = ""
+) -> None:
     """The contact as a surface in Wavefront OBJ.
 
     Args:
@@ -43,6 +45,7 @@ def write_obj(path: Path, depth_mm: Tensor, normal: Tensor, contact: Tensor, mm_
         contact: (1, 1, H, W) bool; four neighbours in contact make two triangles.
         mm_per_pixel: pitch, mm.
         frame: in which it is written.
+        text: comment at its beginning, one line; without one the frame's axes.
     """
     inside = contact[0, 0].cpu().numpy()
     points = frame.points(depth_to_points(depth_mm, mm_per_pixel, contact).cpu()).numpy()
@@ -51,7 +54,7 @@ def write_obj(path: Path, depth_mm: Tensor, normal: Tensor, contact: Tensor, mm_
     block = inside[:-1, :-1] & inside[1:, :-1] & inside[:-1, 1:] & inside[1:, 1:]
     a, b, c, d = (part[block] for part in (index[:-1, :-1], index[1:, :-1], index[:-1, 1:], index[1:, 1:]))
     faces = np.concatenate((np.stack((a, b, d), 1), np.stack((a, d, c), 1)))  # counter-clockwise from the camera
-    lines = [f"# torchvts: {frame.axes}"]
+    lines = [f"# torchvts: {text or frame.axes}"]
     digits = 6 + round(math.log10(frame.mm))  # nm
     lines += [f"v {x:.{digits}f} {y:.{digits}f} {z:.{digits}f}" for x, y, z in points.tolist()]
     lines += [f"vn {x:.6f} {y:.6f} {z:.6f}" for x, y, z in normals.tolist()]

@@ -22,6 +22,7 @@ def summary_of(stream: TactileStream, frames: int) -> dict[str, Any]:
         "left_out_because": [[number, reason] for number, reason in stream.left_out],
         "sensor": stream.calibration.sensor.name,
         "metric": stream.metric,
+        "doubts": list(stream.calibration.report.get("doubts", [])),
         "mm_per_pixel": stream.calibration.sensor.mm_per_pixel,
         "calibration_note": stream.note,
     }
@@ -67,6 +68,11 @@ class StreamReport:
         """Frames a second from the start to the last frame, drawing and writing included."""
         return len(self.rows) / max(self._end - self._begin, 1e-9)
 
+    @property
+    def doubted(self) -> int:
+        """Number of frames in doubt."""
+        return sum(row[6] != "" for row in self.rows)
+
     def summary(self) -> dict[str, Any]:
         """For JSON: :func:`summary_of`, frames and dropped ones, fps, stages_ms, contact, last light, frames in doubt."""
         stream = self.stream
@@ -78,7 +84,7 @@ class StreamReport:
             "contact_frames": sum(row[2] > 0 for row in self.rows),
             "deepest_mm": max((row[3] for row in self.rows), default=0.0),
             "light_level": [round(v, 5) for v in self.rows[-1][4]] if self.rows else [],
-            "doubted_frames": sum(row[6] != "" for row in self.rows),
+            "doubted_frames": self.doubted,
         }
 
     def table(self) -> str:
@@ -88,13 +94,14 @@ class StreamReport:
         if values["left_out"]:
             lines.append(f"{values['left_out']} left out, named above")
         lines.append("median ms: " + ", ".join(f"{name} {ms:.1f}" for name, ms in values["stages_ms"].items()))
-        unit = "mm" if values["metric"] else "mm (NOT METRIC)"
+        unit = "mm" if values["metric"] else "(not in mm)"
         lines.append(f"contact in {values['contact_frames']} frames, deepest {values['deepest_mm']:.3f} {unit}")
         if values["light_level"]:
             lines.append("light at the end, R G B: " + " ".join(f"{v:.3f}" for v in values["light_level"]) + " of the background's")
         if values["doubted_frames"]:
             first = next(row for row in self.rows if row[6])
-            lines.append(f"{values['doubted_frames']} frames in doubt (see frames.csv), the first of them {first[0]}: {first[6]}")
+            count = f"{values['doubted_frames']} of {values['frames']} frames"
+            lines.append(f"in doubt: {count} (column doubt of frames.csv), the first {first[0]}: {first[6]}")
         return "\n".join(lines)
 
     def save(self, folder: Path) -> None:

@@ -34,7 +34,7 @@ import torch
 from conftest import ring_lights, write_film
 
 import torchvts as vts
-from torchvts.core.files import read_depth_png, read_frames, write_atomically, write_depth_png
+from torchvts.core.files import read_depth_png, write_atomically, write_depth_png
 from torchvts.model.response_field import ResponseField, ResponseModel
 
 LONG = os.environ.get("TORCHVTS_TEST_PROFILE") == "long"
@@ -145,7 +145,7 @@ READERS = {
     "small.pcd": (write_compressed_cloud, read_cloud),
     "cloud.ply": (write_cloud, read_cloud),
     "text.ply": (lambda path: write_cloud(path, True), read_cloud),
-    "film.avi": (write_grey_film, lambda path: list(read_frames(path))),
+    "film.avi": (write_grey_film, lambda path: list(vts.frames(path))),
     "catalog.csv": folder_file("catalog.csv"),
     "labels.csv": folder_file("labels.csv"),
     "label.npz": folder_file("label.npz"),
@@ -557,7 +557,7 @@ def test_a_kill_in_the_middle_of_a_save_leaves_a_whole_file(tmp_path, kinds):
 def test_what_a_killed_writer_leaves_is_no_frame(tmp_path):
     vts.write_image(tmp_path / "a.png", image())
     (tmp_path / ".b-0123abcd.png").write_bytes(b"\x89PNG")
-    assert [name for name, _ in read_frames(tmp_path)] == ["a"]
+    assert [name for name, _ in vts.frames(tmp_path)] == ["a"]
     reader = vts.stream.open_source(tmp_path)
     assert reader.read() is not None and reader.read() is None
 

@@ -13,7 +13,7 @@ NAMES = [
     "NormalFromIntensity", "NormalFromLookup", "NormalFromMLP", "NormalFromResponse", "NormalModel", "PointLights",
     "PoissonBackground", "PoissonDCT", "PoissonDST", "PoseTracker", "Press", "Rectify", "Result", "Sensor", "calibrate",
     "depth_to_points",
-    "diagnose", "fit_lights", "gs_sdk", "near_field_shading", "poisson_background", "poisson_dct", "poisson_dst",
+    "diagnose", "fit_lights", "frames", "gs_sdk", "near_field_shading", "poisson_background", "poisson_dct", "poisson_dst",
     "read_image", "read_presses", "read_result", "register_depth", "register_points", "scenes", "shipped_sensors", "stream",
     "write_image",
 ]  # fmt: skip

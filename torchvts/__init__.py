@@ -8,6 +8,7 @@
 * Parts of a pipeline, in its order: ``Rectify`` (raw frames), ``Compensate``, ``ContactMask``, a ``NormalModel``,
   ``GradientFromNormal``, an ``Integrator``, ``ContactFromDepth``. Models are named ``NormalFrom...``, integrators ``Poisson...``
   and ``AdaptiveIntegration``; ``poisson_dct`` and the like are the same as functions.
+* Input: ``frames`` of images, folders, TIFFs, videos and cameras; ``read_image``, ``write_image``, ``read_result``.
 * With depth: ``depth_to_points``, ``register_depth``, ``PoseTracker``, ``ConfidentPipeline``, ``diagnose``, ``stream``.
   ``scenes`` has exact scenes for tests.
 
@@ -37,6 +38,7 @@ from .normals import NormalFromIntensity, NormalFromLookup, NormalFromMLP, Norma
 from .pipeline import ConfidentPipeline, DepthOutput, DepthPipeline, FrozenPipeline
 from .pose import PoseTracker, register_depth, register_points
 from .skin import ContactFromDepth, ContactMask, ContactSettings
+from .stream import frames
 
 __all__ = [
     "AdaptiveIntegration",
@@ -70,6 +72,7 @@ __all__ = [
     "depth_to_points",
     "diagnose",
     "fit_lights",
+    "frames",
     "gs_sdk",
     "near_field_shading",
     "poisson_background",

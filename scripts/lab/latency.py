@@ -9,9 +9,9 @@ from typing import NamedTuple
 import numpy as np
 
 from torchvts.core.checks import check_integer, check_positive
+from torchvts.core.recordings import Pixels
 from torchvts.model import Calibration
 from torchvts.stream import Overlay, TactileFrame, TactileStream
-from torchvts.stream.sources import Pixels
 
 
 class SimulatedCamera:

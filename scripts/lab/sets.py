@@ -19,8 +19,9 @@ from torch import Tensor
 from torchvts.calibration import RESPONSE_BLUR_PX, Press, fit_prior, read_presses
 from torchvts.compensate import Compensate
 from torchvts.core.checks import check_image, check_integer
-from torchvts.core.files import image_files, read_image, rgb_from_bgr
+from torchvts.core.files import read_image, rgb_from_bgr
 from torchvts.core.geometry import GradientFromNormal
+from torchvts.core.recordings import image_files
 from torchvts.integration import poisson_dct
 from torchvts.model import Calibration, Sensor
 from torchvts.normals import NormalFromMLP

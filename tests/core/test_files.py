@@ -11,14 +11,8 @@ from conftest import ring_lights, write_film
 
 import torchvts as vts
 from torchvts import stream as streams
-from torchvts.core.files import (
-    count_frames,
-    read_depth_png,
-    read_frames,
-    rgb_from_bgr,
-    write_atomically,
-    write_depth_png,
-)
+from torchvts.core.files import read_depth_png, rgb_from_bgr, write_atomically, write_depth_png
+from torchvts.core.recordings import count_frames, cut_short
 from torchvts.dataset import list_items
 from torchvts.pose import read_cloud
 
@@ -104,7 +98,7 @@ def test_frames_of_a_folder_come_in_the_order_of_their_numbers(tmp_path, names):
     for k in reversed(range(len(names))):
         vts.write_image(tmp_path / f"{names[k]}.png", picture(seed=k))
     (tmp_path / "notes.txt").write_text("no image")
-    frames, reader = list(read_frames(tmp_path)), streams.open_source(tmp_path)
+    frames, reader = list(vts.frames(tmp_path)), streams.open_source(tmp_path)
     assert [name for name, _ in frames] == names and count_frames(tmp_path) == len(names)
     assert [item.stem for item in list_items(tmp_path)] == names
     for k, (_, frame) in enumerate(frames):
@@ -114,21 +108,70 @@ def test_frames_of_a_folder_come_in_the_order_of_their_numbers(tmp_path, names):
 def test_frames_of_a_video(tmp_path):
     red = np.array([0, 0, 1], np.uint8)
     path = write_film(tmp_path / "film.avi", [np.full((48, 64, 3), 40 * k, np.uint8) * red for k in range(5)])
-    frames = list(read_frames(path))
+    frames = list(vts.frames(path))
     assert [name for name, _ in frames] == [f"film_{k:06d}" for k in range(5)] and count_frames(path) == 5
     for k, (_, frame) in enumerate(frames):
         assert frame.shape == (3, 48, 64)
         assert frame.mean(dim=(1, 2)).tolist() == pytest.approx([40 * k / 255, 0, 0], abs=0.01)
 
 
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_all_pages_of_a_tiff_are_frames(tmp_path, dtype):
+    pages = [np.random.default_rng(k).integers(0, np.iinfo(dtype).max, (12, 16, 3)).astype(dtype) for k in range(37)]
+    path = tmp_path / "rec.tif"
+    cv2.imwritemulti(str(path), pages)
+    frames, reader = list(vts.frames(path)), streams.open_source(path)
+    assert [name for name, _ in frames] == [f"rec_{k:06d}" for k in range(37)] and count_frames(path) == 37
+    assert all(torch.equal(frame, rgb_from_bgr(page)) for (_, frame), page in zip(frames, pages, strict=True))
+    assert all(np.array_equal(reader.read(), page) for page in pages) and reader.read() is None
+    (item,) = list_items(tmp_path)
+    assert item.is_film and item.frame_stem(3) == "rec_000003"
+    with pytest.raises(ValueError, match="expected one image, got a TIFF of 37 pages"):
+        vts.read_image(path)
+    vts.write_image(tmp_path / "z.tif", picture())  # a folder may hold both
+    assert len(list(vts.frames(tmp_path))) == count_frames(tmp_path) == 38
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    assert (
+        0 < count_frames(path) < 38
+        and cut_short(path, 3) == f"cut short? it announces {count_frames(path)} frames, 3 could be read"
+    )
+
+
+EXIF_TURNED = bytes.fromhex("ffe100224578696600004d4d002a00000008000101120003000000010003000000000000")
+"""The segment of a JPEG that says that it is to be shown turned by 180 degrees."""
+
+
+def test_an_image_that_its_exif_tag_turns_is_turned(tmp_path):
+    image = torch.nn.functional.interpolate(picture(3, 4)[None], (48, 64), mode="bilinear")[0]
+    vts.write_image(tmp_path / "up.jpg", image.flip(1, 2))
+    plain, content = vts.read_image(tmp_path / "up.jpg"), (tmp_path / "up.jpg").read_bytes()
+    (tmp_path / "up.jpg").write_bytes(content[:2] + EXIF_TURNED + content[2:])
+    assert torch.equal(vts.read_image(tmp_path / "up.jpg"), plain.flip(1, 2))
+    assert float((vts.read_image(tmp_path / "up.jpg") - image).abs().mean()) < 0.02
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"GIF89a" + bytes(60), "got a GIF, which keeps 256 colours: save its frames as PNG"),
+        (b"RIFF\x00\x00\x00\x00WEBPVP8X\x0a\x00\x00\x00\x02" + bytes(60), "expected one image, got an animation"),
+        (b"\x89PNG\r\n\x1a\n" + bytes(25) + b"\x00\x00\x00\x08acTL" + bytes(60), "expected one image, got an animation"),
+    ],
+)
+def test_animations_are_refused_and_not_read_by_their_first_frame(tmp_path, content, message):
+    (tmp_path / "film.png").write_bytes(content)
+    with pytest.raises(ValueError, match=message):
+        vts.read_image(tmp_path / "film.png")
+
+
 def test_missing_and_broken_sources_are_refused(tmp_path):
     with pytest.raises(ValueError, match="no images in this folder"):
-        read_frames(tmp_path)
+        vts.frames(tmp_path)
     with pytest.raises(FileNotFoundError, match="nowhere: no such file or folder"):
-        read_frames(tmp_path / "nowhere")
+        vts.frames(tmp_path / "nowhere")
     (tmp_path / "film.avi").write_bytes(b"no film")
     with pytest.raises(ValueError, match=r"film\.avi: not a video, or cut short"):
-        list(read_frames(tmp_path / "film.avi"))
+        list(vts.frames(tmp_path / "film.avi"))
 
 
 @pytest.fixture(scope="module")
@@ -202,14 +245,14 @@ def test_names_that_are_not_utf_8(tmp_path):
     image = torch.rand(3, 8, 8).mul(255).round() / 255
     vts.write_image(folder / f"{name}.png", image)
     assert torch.allclose(vts.read_image(folder / f"{name}.png"), image)
-    assert [frame.shape for _, frame in read_frames(folder)] == [(3, 8, 8)]
+    assert [frame.shape for _, frame in vts.frames(folder)] == [(3, 8, 8)]
     assert streams.open_source(folder).read().shape == (8, 8, 3)
     calibration().save(folder / f"{name}.safetensors")
     assert vts.Calibration.load(folder / f"{name}.safetensors").sensor.name == "rig"
     vts.Sensor.load("gelsight_mini").save(folder / f"{name}.yaml")
     assert vts.Sensor.load(folder / f"{name}.yaml").height == 240
     (folder / f"{name}.avi").write_bytes(b"RIFF")
-    for read in (lambda path: list(read_frames(path)), streams.open_source):
+    for read in (lambda path: list(vts.frames(path)), streams.open_source):
         with pytest.raises(
             ValueError, match=r"video: expected a name in UTF-8, which OpenCV needs, got '.*\\udcfe\.avi': rename it"
         ):

@@ -260,10 +260,8 @@ def test_a_frame_that_does_not_fit_is_refused(options, size, message):
 
 
 def test_the_wedge_video_is_rectified_to_its_gel(data):
-    from torchvts.core.files import read_frames
-
     video = next(path for path in sorted((data / "wedge_video").iterdir()) if path.suffix in (".avi", ".mp4", ".mov"))
-    _, first = next(iter(read_frames(video)))
+    _, first = next(iter(vts.frames(video)))
     gel = vts.Sensor.load("gelsight_wedge").rectify(first[None])
     assert gel.shape == (1, 3, 300, 400)
     assert float(gel.amin()) >= 0 and float(gel.mean(dim=1).amin()) > 0.02, "no pixel from beyond the frame"

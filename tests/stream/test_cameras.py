@@ -11,7 +11,7 @@ from conftest import Frames, ring_lights
 import torchvts as vts
 from torchvts import stream as streams
 from torchvts.cli.source import play
-from torchvts.core.files import read_frames, rgb_from_bgr
+from torchvts.core.files import rgb_from_bgr
 from torchvts.stream import StreamReport
 from torchvts.stream.sources import SETTLING, LiveReader, check_reader, times_file
 
@@ -240,7 +240,7 @@ def test_a_camera_that_stops_leaves_the_frames_until_then(tmp_path):
         lost = play(stream, lambda frame: taken.append(frame.number) is None)
         assert isinstance(lost, OSError) and "gives no more frames" in str(lost)
         assert taken and StreamReport(stream).table()
-    assert len(list(read_frames(tmp_path / "raw.mkv"))) == 25
+    assert len(list(vts.frames(tmp_path / "raw.mkv"))) == 25
 
 
 @pytest.mark.parametrize("realtime", [False, True])

@@ -27,7 +27,7 @@ import torchvts as vts
 from lab.latency import measure_latency
 from torchvts import stream as streams
 from torchvts.cli.stream import with_corners
-from torchvts.core.files import read_frames, rgb_from_bgr
+from torchvts.core.files import rgb_from_bgr
 from torchvts.pipeline import unit_pipeline
 from torchvts.stream.sources import times_file
 
@@ -75,7 +75,7 @@ def video(unit, tmp_path_factory):
     "name, error, message",
     [
         ("none.avi", FileNotFoundError, "source: .*no such file or folder"),
-        ("text.txt", ValueError, "source: .*expected a video"),
+        ("text.txt", ValueError, "source: .*expected a video or an image"),
         ("empty", ValueError, "source: .*no images"),
         ("damaged.avi", ValueError, "source: .*not a video"),
     ],
@@ -186,7 +186,7 @@ def test_corners_are_rectified(unit, small_sensor, tmp_path):
     pictures = [cv2.warpPerspective(camera(1.0 if k >= 14 else 0.0), there, (240, 180)) for k in range(18)]
     video = write_film(tmp_path / "slanted.avi", pictures)
     sensor = replace(small_sensor, corners_px=tuple(corners))
-    background = sensor.rectify(torch.stack([frame for _, frame in read_frames(video)])[:12]).mean(0)
+    background = sensor.rectify(torch.stack([frame for _, frame in vts.frames(video)])[:12]).mean(0)
     with streams.TactileStream(video, vts.Calibration.from_lights(calibration.lights, sensor, background)) as stream:
         areas = [float(frame.output.deformed.double().mean()) for frame in stream]
     assert max(areas[:14]) == 0 and min(areas[14:]) > 0.05
@@ -352,7 +352,7 @@ def test_frames_whose_names_have_blanks_keep_their_times(tmp_path):
     for k in range(3):
         vts.write_image(tmp_path / f"img {k}.png", torch.full((3, 8, 8), 0.1 * k))
     times_file(tmp_path).write_text("frame,time_s\n" + "".join(f"img {k},{0.4 * k}\n" for k in range(3)))
-    assert streams.sources.FolderReader(tmp_path).times == pytest.approx([0.0, 0.4, 0.8])
+    assert streams.sources.FileReader(tmp_path).times == pytest.approx([0.0, 0.4, 0.8])
 
 
 def test_both_scripts_give_the_same_depth_for_a_video(unit, run_stream, run_script, small_sensor, tmp_path):
@@ -576,7 +576,7 @@ def test_a_video_file_is_whole_or_not_there(tmp_path, suffix):
         for _ in range(3):
             video.write(picture)
         assert not path.exists()
-    assert len(list(read_frames(path))) == 3
+    assert len(list(vts.frames(path))) == 3
     with pytest.raises(ValueError, match=r"like the first, got \(16, 64\)"), streams.VideoFile(path, 30.0) as video:
         video.write(picture)
         video.write(picture[:16])
@@ -659,7 +659,7 @@ def test_the_script_writes_overlay_summary_and_frames(run_stream, unit_file, vid
     assert summary["frames"] == 35 and summary["contact_frames"] == 10 and summary["deepest_mm"] == pytest.approx(1.0, abs=0.1)
     assert {"read", "depth", "draw", "write"} <= set(summary["stages_ms"])
     assert len((tmp_path / "frames.csv").read_text().splitlines()) == 36
-    assert len(list(read_frames(tmp_path / "overlay.avi"))) == 35
+    assert len(list(vts.frames(tmp_path / "overlay.avi"))) == 35
 
 
 def test_track_writes_a_row_for_each_frame_after_the_reference(run_script, unit_file, video, tmp_path):
@@ -746,7 +746,7 @@ def test_what_came_before_ctrl_c_is_kept(run_stream, unit_file, video, tmp_path,
     before = signal.getsignal(number)
     done = run_stream("--source", video, "--calibration", unit_file, "--out", tmp_path, "--video", "avi")
     assert done.returncode == 0 and "interrupted" in done.stdout, done.stderr
-    assert len(list(read_frames(tmp_path / "overlay.avi"))) == 20
+    assert len(list(vts.frames(tmp_path / "overlay.avi"))) == 20
     assert not list(tmp_path.glob(".overlay*")) and (tmp_path / "summary.json").is_file()
     assert signal.getsignal(number) == before
 
@@ -782,7 +782,7 @@ def test_a_process_ended_in_the_middle_leaves_a_whole_video_or_none(unit, unit_f
         assert not final.exists()
         return
     assert process.returncode == 0 and "interrupted" in output
-    assert 0 < len(list(read_frames(final))) < 1800
+    assert 0 < len(list(vts.frames(final))) < 1800
     assert not list(out.glob(".overlay*")) and (out / "summary.json").is_file()
 
 

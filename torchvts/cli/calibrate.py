@@ -18,9 +18,9 @@ import torch
 
 from ..calibration import Press, read_presses
 from ..calibration.presses import check_presses
-from ..core.files import make_folder, read_frames
+from ..core.files import make_folder
 from ..model import Sensor
-from ..stream import read_background, read_press_images
+from ..stream import frames, read_background, read_press_images
 from ..viz import calibration_figure, save_figure
 from .options import add_background_frames, add_press, add_sensor, cut_frames, load_sensor
 from .parser import UsageError
@@ -112,5 +112,5 @@ def warn_of_a_small_place(sensor: Sensor) -> None:
 
 def size_of(source: Path) -> tuple[int, int]:
     """Height and width of the first image of a source; of a calibration folder, of its background."""
-    _, image = next(iter(read_frames(source / "background.png" if source.is_dir() else source)))
+    _, image = next(iter(frames(source / "background.png" if source.is_dir() else source)))
     return image.shape[1], image.shape[2]

@@ -14,7 +14,8 @@ from pathlib import Path
 
 from torch import Tensor
 
-from ..core.files import VIDEO_SUFFIXES, read_image
+from ..core.files import read_image
+from ..core.recordings import is_film
 from ..diagnose import diagnose
 from ..stream import read_background
 from .options import load_calibration
@@ -35,7 +36,7 @@ def run(arguments: argparse.Namespace) -> int:
     calibration = load_calibration(arguments.calibration)
 
     def read(path: Path) -> Tensor:
-        if path.suffix.lower() in VIDEO_SUFFIXES and path == arguments.background:
+        if path == arguments.background and is_film(path):
             return read_background([path], calibration.sensor)
         image = read_image(path)
         try:

@@ -15,8 +15,8 @@ from pathlib import Path
 import torch
 
 from .. import export
-from ..core.files import read_frames
 from ..pipeline import unit_pipeline
+from ..stream import frames
 from .options import add_mode, add_network, add_out, load_calibration
 
 USAGE = "CALIBRATION --out FOLDER [--format NAME...] [--mode MODE]"
@@ -38,7 +38,7 @@ def run(arguments: argparse.Namespace) -> int:
     pipe = unit_pipeline(calibration, arguments.mode, arguments.network)
     images = export.sample_frames(calibration)
     if arguments.frames:
-        real = [calibration.sensor.rectify(image[None]) for _, image in itertools.islice(read_frames(arguments.frames), 8)]
+        real = [calibration.sensor.rectify(image[None]) for _, image in itertools.islice(frames(arguments.frames), 8)]
         images = torch.cat([*real, images])
     rows = export.export_checked(pipe, arguments.out, arguments.format, images)
     print("| format | file | kB | largest depth difference, mm | result |\n|---|---|---|---|---|")

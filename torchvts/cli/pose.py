@@ -19,12 +19,13 @@ import torch
 from tqdm import tqdm
 
 from .. import viz
-from ..core.files import count_frames, make_folder, read_frames, read_image, write_atomically
+from ..core.files import make_folder, read_image, write_atomically
+from ..core.recordings import count_frames
 from ..pipeline import DepthOutput, unit_pipeline
 from ..pose import OutputFrame, contact_cloud, read_point_cloud, register_depth, register_points, write_point_cloud
 from ..pose.clouds import CLOUD_SUFFIXES
 from ..pose.result import Registration
-from ..stream import FrameCheck
+from ..stream import FrameCheck, frames
 from .options import add_length_unit, add_mode, add_network, add_out, load_calibration
 
 USAGE = "SOURCE REFERENCE [--calibration FILE] --out FOLDER"
@@ -104,7 +105,7 @@ def of_frames(arguments: argparse.Namespace) -> list[dict[str, Any]]:
     results: list[dict[str, Any]] = []
     last = None
     count = count_frames(arguments.source)
-    for name, image in tqdm(read_frames(arguments.source), total=count, unit="frame", disable=None):
+    for name, image in tqdm(frames(arguments.source), total=count, unit="frame", disable=None):
         try:
             frame = depth_of(image)
             found = register_depth(frame, target, pitch, initial=last)

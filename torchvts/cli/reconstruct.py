@@ -18,12 +18,13 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from ..core.files import VIDEO_SUFFIXES, make_folder, read_frames
+from ..core.files import make_folder
+from ..core.recordings import is_film
 from ..dataset import CLOUD_FORMATS, FORMATS, PICTURES_UP_TO, Report, list_items, reconstruct_dataset
 from ..diagnose import Finding, diagnose
 from ..model import Calibration
 from ..model.report import warnings_of
-from ..stream import NOT_METRIC, read_background, read_press_images
+from ..stream import NOT_METRIC, frames, read_background, read_press_images
 from .options import (
     add_background_frames,
     add_length_unit,
@@ -112,7 +113,7 @@ def calibrate_first(arguments: argparse.Namespace, inputs: list[Path]) -> Path:
     """Calibrate as ``torchvts stream`` does, and keep the file with the results."""
     if int(os.environ.get("WORLD_SIZE", "1")) > 1:
         raise UsageError("--sensor: expected one process, got more: calibrate first, by torchvts calibrate, and give the file")
-    video = next((path for path in inputs if path.suffix.lower() in VIDEO_SUFFIXES), None)
+    video = next((path for path in inputs if is_film(path)), None)
     if arguments.background is None and video is None:
         raise UsageError(f"--background: expected images without contact, got none: {inputs[0]} is no video that begins with them")
     unit = load_sensor(arguments.sensor)
@@ -168,11 +169,11 @@ def diagnose_some(unit: Calibration, inputs: list[Path], report: Report, every: 
         items = list({item.file.parent: item for item in reversed(items)}.values())[::-1][:DIAGNOSED]
     found: dict[str, list[tuple[str, Finding]]] = {}
     for item in tqdm(items, desc="diagnosing", leave=False, disable=None):
-        name = item.frame_name(0 if item.is_video else -1)
+        name = item.frame_name(0 if item.is_film else -1)
         if name in left_out:
             continue
         try:
-            _, raw = next(iter(read_frames(item.file)))
+            _, raw = next(iter(frames(item.file)))
             image = unit.sensor.rectify(raw[None])[0]
         except (OSError, ValueError, StopIteration):  # named where it was to be reconstructed
             continue

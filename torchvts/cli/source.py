@@ -13,7 +13,7 @@ from ..calibration import Press
 from ..core.checks import check_integer
 from ..model import Calibration, Sensor
 from ..stream import Camera, CameraSettings, Recorder, TactileFrame, TactileStream, find_camera
-from ..stream.sources import FolderReader
+from ..stream.sources import FileReader
 from .options import add_background_frames, add_pipeline, add_sensor, contact_of, load_calibration, load_sensor
 from .parser import UsageError
 
@@ -71,7 +71,7 @@ def open_stream(arguments: argparse.Namespace, unit: Sensor | Calibration, press
     )
     first = arguments.background_frames
     note = f"the first {first} are without contact" if first else "the calibration's background is used as it is"
-    assumed = " are assumed, without times.csv" if isinstance(stream.reader, FolderReader) and not stream.reader.times else ""
+    assumed = " are assumed, without times.csv" if isinstance(stream.reader, FileReader) and stream.reader.fps_assumed else ""
     print(f"{stream.reader.name}: {stream.fps:g} frames a second{assumed}; {note}")
     print(f"{stream.note}\nready after {time.perf_counter() - started:.1f} s")
     return stream

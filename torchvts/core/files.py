@@ -4,12 +4,10 @@ import errno
 import hashlib
 import json
 import os
-import re
 import secrets
 import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
-from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
@@ -22,10 +20,17 @@ from torch import Tensor
 from .checks import MOST_PIXELS, check_field, check_path
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
+PAGED_SUFFIXES = (".tif", ".tiff")
 VIDEO_SUFFIXES = (".avi", ".mp4", ".mov", ".mkv", ".webm")
+
+IN_COLOUR = 6
+"""OpenCV's IMREAD_ANYDEPTH | IMREAD_ANYCOLOR: grey stays grey, 16 bits stay 16, and an image that its EXIF tag turns is turned."""
 
 MOST_BYTES = 2**29
 """A larger image file is not read."""
+
+MOST_PAGES = 10**5
+"""Pages of a TIFF that are looked for."""
 
 MOST_TENSOR_BYTES = 2**31
 """A larger file of tensors is not read."""
@@ -143,7 +148,8 @@ def write_atomically(path: str | Path) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
-def _image_path(path: str | Path) -> Path:
+def image_path(path: str | Path) -> Path:
+    """The path of a file to read, or FileNotFoundError."""
     path = check_path("path", path)
     if path.is_dir():
         raise FileNotFoundError(f"{path}: expected an image, got a folder: name one of its files")
@@ -157,22 +163,67 @@ def read_image(path: str | Path) -> Tensor:
 
     Raises:
         FileNotFoundError: no such file.
-        ValueError: not an image, or not in colour.
+        ValueError: not an image, not in colour, or several: an animation, a TIFF of several pages.
     """
     return rgb_from_bgr(read_pixels(path))
 
 
 def read_pixels(path: str | Path) -> np.ndarray[Any, Any]:
     """Read an image file as OpenCV gives it, (H, W, 3) B, G, R, 8 or 16 bits; raises as :func:`read_image`."""
-    import cv2
-
-    path = _image_path(path)
+    path = image_path(path)
     if path.suffix.lower() in VIDEO_SUFFIXES:
         raise ValueError(
             f"{path}: expected an image, got a video: torchvts.stream.read_background([path], sensor) makes a background of its "
             "first frames, torchvts reconstruct takes all of them"
         )
-    pixels = decode_image(path, cv2.IMREAD_UNCHANGED)
+    _check_still(path)
+    return check_colour(decode_image(path, IN_COLOUR), path)
+
+
+def _check_still(path: Path) -> None:
+    """Refuse a file of several frames, of which only the first would be read."""
+    with path.open("rb") as stream:
+        head = stream.read(64)
+    remedy = "save its frames as PNG, as a TIFF of several pages or as a video without loss"
+    if head[:4] == b"GIF8":
+        raise ValueError(f"{path}: expected an image of 8 bits a channel, got a GIF, which keeps 256 colours: {remedy}")
+    if (head[8:16] == b"WEBPVP8X" and head[20] & 2) or b"acTL" in head:
+        raise ValueError(f"{path}: expected one image, got an animation: {remedy}")
+    if path.suffix.lower() in PAGED_SUFFIXES and (count := len(page_places(path))) > 1:
+        raise ValueError(f"{path}: expected one image, got a TIFF of {count} pages: vts.frames and torchvts reconstruct take all")
+
+
+def page_places(path: Path) -> list[int]:
+    """Where the pages of a TIFF begin; the last one is missing where the file is cut short. [] for other files."""
+    found: list[int] = []
+    with path.open("rb") as stream:
+        head = stream.read(16)
+        order, size = {b"II": "<", b"MM": ">"}.get(head[:2], ""), path.stat().st_size
+        if not order or len(head) < 16 or struct.unpack(f"{order}H", head[2:4])[0] not in (42, 43):
+            return found
+        large = struct.unpack(f"{order}H", head[2:4])[0] == 43  # BigTIFF
+        number, entry, pointer = ("Q", 20, "Q") if large else ("H", 12, "I")
+        (place,) = struct.unpack_from(f"{order}{pointer}", head, 8 if large else 4)
+        while place and place not in found and len(found) < MOST_PAGES:
+            found.append(place)
+            stream.seek(min(place, size))
+            counted = stream.read(struct.calcsize(number))
+            if len(counted) < struct.calcsize(number):
+                break
+            stream.seek(entry * min(struct.unpack(f"{order}{number}", counted)[0], size), 1)
+            following = stream.read(struct.calcsize(pointer))
+            if len(following) < struct.calcsize(pointer):
+                break
+            (place,) = struct.unpack(f"{order}{pointer}", following)
+    return found
+
+
+def check_colour(pixels: np.ndarray[Any, Any] | None, path: Path) -> np.ndarray[Any, Any]:
+    """The colours of a decoded image (H, W, 3 or 4), B, G, R.
+
+    Raises:
+        ValueError: it could not be decoded, has other channels, or not 8 or 16 bits.
+    """
     if pixels is None:
         raise ValueError(f"{path}: not an image, or cut short")
     if pixels.ndim != 3 or pixels.shape[2] not in (3, 4):
@@ -326,7 +377,7 @@ def read_depth_png(path: str | Path) -> Tensor:
     """Read what :func:`write_depth_png` wrote: (1, 1, H, W), mm."""
     import cv2
 
-    path = _image_path(path)
+    path = image_path(path)
     pixels = decode_image(path, cv2.IMREAD_UNCHANGED)
     if pixels is None or pixels.dtype != np.uint16 or pixels.ndim != 2:
         raise ValueError(f"{path}: expected a 16-bit grey PNG with depth")
@@ -344,94 +395,6 @@ def write_pixels(path: Path, pixels: np.ndarray[Any, Any]) -> None:
         raise OSError(f"{path}: OpenCV could not encode it")
     with write_atomically(path) as temporary:
         temporary.write_bytes(data.tobytes())
-
-
-def read_frames(source: str | Path) -> Iterator[tuple[str, Tensor]]:
-    """Frames of an image file, a folder of images (1, 2, 10) or a video: pairs of a name and (3, H, W) in [0, 1], R, G, B.
-
-    Raises:
-        FileNotFoundError: no such file or folder.
-        ValueError: a file that cannot be read, or a folder without images.
-    """
-    path = Path(source)
-    if path.is_dir():
-        files = image_files(path)
-        if not files:
-            raise ValueError(f"{path}: no images in this folder ({', '.join(IMAGE_SUFFIXES)})")
-        return ((file.stem, read_image(file)) for file in files)
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file or folder")
-    if path.suffix.lower() in VIDEO_SUFFIXES:
-        return _read_video(path)
-    return iter([(path.stem, read_image(path))])
-
-
-def natural_order(name: str) -> tuple[list[str | Decimal], str]:
-    """Key that sorts names with their numbers as numbers, decimals of times too.
-
-    Example:
-        >>> sorted(["10.png", "2.png", "1.25.png", "1.5.png"], key=natural_order)
-        ['1.25.png', '1.5.png', '2.png', '10.png']
-    """
-    parts = re.split(r"([0-9]+(?:\.[0-9]+)?)", name)
-    return [Decimal(part) if k % 2 else part for k, part in enumerate(parts)], name
-
-
-def image_files(folder: Path) -> list[Path]:
-    """Images of a folder in :func:`natural_order`, without hidden ones, which a killed writer may leave."""
-    files = (p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith("."))
-    return sorted(files, key=lambda p: natural_order(p.name))
-
-
-def count_frames(source: str | Path) -> int:
-    """Number of frames that :func:`read_frames` will give, for progress bars; of a video the number in its header."""
-    import cv2
-
-    path = Path(source)
-    if path.is_dir():
-        return len(image_files(path))
-    if path.suffix.lower() in VIDEO_SUFFIXES:
-        try:
-            return max(0, int(open_video(path).get(cv2.CAP_PROP_FRAME_COUNT)))
-        except ValueError:  # its name
-            return 1
-    return 1
-
-
-def cut_short(path: Path, count: int) -> str:
-    """What to say of a video of which fewer frames could be read than its header announces; "" where it is whole.
-
-    Containers that hold no number give one by length and rate, which is some frames off.
-    """
-    announced = count_frames(path)
-    return f"cut short? it announces {announced} frames, {count} could be read" if count < 0.9 * announced - 1 else ""
-
-
-def open_video(path: Path) -> Any:
-    """OpenCV's capture of a video file, which may not be opened.
-
-    Raises:
-        ValueError: the name is not UTF-8.
-    """
-    import cv2
-
-    return cv2.VideoCapture(check_text_name("video", path))
-
-
-def _read_video(path: Path) -> Iterator[tuple[str, Tensor]]:
-    capture = open_video(path)
-    number = 0
-    try:
-        while True:
-            there, pixels = capture.read()
-            if not there:
-                break
-            yield f"{path.stem}_{number:06d}", rgb_from_bgr(pixels)
-            number += 1
-    finally:
-        capture.release()
-    if number == 0:
-        raise ValueError(f"{path}: not a video, or cut short: no frame could be read")
 
 
 def save_tensors(path: str | Path, tensors: dict[str, Tensor], metadata: dict[str, Any]) -> None:

@@ -1,4 +1,4 @@
-"""What a data set holds: its images and videos in a fixed order, and the names of their results."""
+"""What a data set holds: its images and films in a fixed order, and the names of their results."""
 
 import os
 import re
@@ -8,7 +8,8 @@ from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
 
-from ..core.files import IMAGE_SUFFIXES, VIDEO_SUFFIXES, count_frames, natural_order
+from ..core.files import IMAGE_SUFFIXES, PAGED_SUFFIXES, VIDEO_SUFFIXES
+from ..core.recordings import count_frames, is_film, natural_order
 
 STATE = ".torchvts"
 """Folder inside the results that holds the settings and one record per frame; a folder that has one is never read as a source."""
@@ -18,24 +19,21 @@ PICTURES_UP_TO = 20
 
 
 class Item(NamedTuple):
-    """One image or video of a source.
+    """One image or film of a source.
 
     Attributes:
         path: path inside the source, with "/".
         stem: path of its results inside the output folder, without suffix.
         mark: size in bytes and time of modification in ns; another mark means another file.
         file: the file itself.
+        is_film: whether it has frames with numbers: a video, or a TIFF of several pages.
     """
 
     path: str
     stem: str
     mark: tuple[int, int]
     file: Path
-
-    @property
-    def is_video(self) -> bool:
-        """Whether it is a video."""
-        return self.path.lower().endswith(VIDEO_SUFFIXES)
+    is_film: bool
 
     def frame_name(self, number: int) -> str:
         """Name of a frame in tables and messages; ``number`` is negative for an image."""
@@ -83,8 +81,8 @@ def list_items(source: str | Source, every: int = 1) -> Iterator[Item]:
     """
     images = 0
     for item in _list(source):
-        images += not item.is_video
-        if item.is_video or (images - 1) % every == 0:
+        images += not item.is_film
+        if item.is_film or (images - 1) % every == 0:
             yield item
 
 
@@ -102,7 +100,7 @@ def _item(file: Path, prefix: str, stem: str) -> Item:
         status = file.stat()
     except OSError:  # a link that leads nowhere, or to itself: said when it is read
         status = file.lstat()
-    return Item(prefix + file.name, prefix + stem, (status.st_size, status.st_mtime_ns), file)
+    return Item(prefix + file.name, prefix + stem, (status.st_size, status.st_mtime_ns), file, is_film(file))
 
 
 def _several(source: tuple[Path, ...]) -> Iterator[Item]:
@@ -155,11 +153,11 @@ def output_stems(names: list[str]) -> dict[str, str]:
     """
     plain = {name: os.path.splitext(name)[0] for name in names}
     count = Counter(stem.casefold() for stem in plain.values())
-    videos = {plain[name].casefold() for name in names if name.lower().endswith(VIDEO_SUFFIXES)}
+    films = {plain[name].casefold() for name in names if name.lower().endswith(VIDEO_SUFFIXES + PAGED_SUFFIXES)}
 
     def clashes(name: str) -> bool:
         stem = plain[name].casefold()
-        return count[stem] > 1 or (re.sub(r"_\d{6,}$", "", stem) in videos and re.search(r"_\d{6,}$", stem) is not None)
+        return count[stem] > 1 or (re.sub(r"_\d{6,}$", "", stem) in films and re.search(r"_\d{6,}$", stem) is not None)
 
     stems = {name: name if clashes(name) else stem for name, stem in plain.items()}
     return stems if len(set(stems.values())) == len(stems) else {name: name for name in names}
@@ -168,4 +166,4 @@ def output_stems(names: list[str]) -> dict[str, str]:
 def has_few_frames(source: Source, every: int = 1) -> bool:
     """Whether a run over each N-th frame of a source has at most :data:`PICTURES_UP_TO` frames."""
     items = islice(list_items(source, every), PICTURES_UP_TO + 1)
-    return sum(-(-count_frames(item.file) // every) if item.is_video else 1 for item in items) <= PICTURES_UP_TO
+    return sum(-(-count_frames(item.file) // every) if item.is_film else 1 for item in items) <= PICTURES_UP_TO

@@ -1,6 +1,6 @@
 """Reads the frames of a data set in loader processes: images, each process its share, and whole videos in order."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -11,14 +11,15 @@ from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
 from ..core.arrays import Array
 from ..core.checks import in_one_line
-from ..core.files import open_video, read_image, rgb_from_bgr
+from ..core.files import read_pixels, rgb_from_bgr
+from ..core.recordings import Pixels, raw_frames
 from ..model import Sensor
 from .items import Item, list_items
 from .records import Records
 
 
-class Frame(NamedTuple):
-    """A frame as a loader hands it over; without image where it cannot be used, or is not needed any more.
+class Entry(NamedTuple):
+    """What a loader hands over: a frame, without image where it cannot be used or is not needed any more, or the end of a film.
 
     Attributes:
         item: the file that it is from.
@@ -39,14 +40,14 @@ class Frame(NamedTuple):
     doubt: str = ""
 
 
-Batch = tuple[list[tuple[Frame, bool]], Array]
+Batch = tuple[list[tuple[Entry, bool]], Array]
 """Frames, whether each has an image, and these images in one array: tensors would go through files in shared memory, which a small
 /dev/shm or a limit of the size of files ends in silence."""
 
 
 def load_frames(
     records: Records, sensor: Sensor, share: tuple[int, int], batch: int, workers: int
-) -> Iterator[tuple[Frame, Tensor | None]]:
+) -> Iterator[tuple[Entry, Tensor | None]]:
     """The images of one rank's share and the first frames of videos, each with its image (1, 3, H, W), rectified, if it has one.
 
     Args:
@@ -81,7 +82,7 @@ class _Frames(IterableDataset[Batch]):
         self.records, self.sensor, self.share, self.batch = records, sensor, share, batch
 
     def __iter__(self) -> Iterator[Batch]:
-        frames: list[tuple[Frame, bool]] = []
+        frames: list[tuple[Entry, bool]] = []
         images: list[Tensor] = []
         for frame, read in self._share():
             image, failed = self._load(read) if read is not None else ([], frame.failed)
@@ -92,23 +93,23 @@ class _Frames(IterableDataset[Batch]):
                 frames, images = [], []
         yield frames, _stacked(images)
 
-    def _load(self, read: "partial[Tensor]") -> tuple[list[Tensor], str]:
+    def _load(self, read: Callable[[], Pixels]) -> tuple[list[Tensor], str]:
         """An image rectified, in a list; or an empty list and why there is none."""
         import cv2
 
         try:
-            return [self.sensor.rectify(read()[None]).clamp(0.0, 1.0)], ""
+            return [self.sensor.rectify(rgb_from_bgr(read())[None]).clamp(0.0, 1.0)], ""
         except (OSError, ValueError, cv2.error) as error:
             return [], in_one_line(error)
 
-    def _share(self) -> Iterator[tuple[Frame, "partial[Tensor] | None"]]:
+    def _share(self) -> Iterator[tuple[Entry, Callable[[], Pixels] | None]]:
         """Frames of this loader process, each with what reads its image if it is to be read."""
         rank, world = self.share
         worker = get_worker_info()
         number, workers = (0, 1) if worker is None else (worker.id, worker.num_workers)
         count = 0
         for item in list_items(self.records.source, self.records.settings.every):
-            if item.is_video:
+            if item.is_film:
                 if number == 0:
                     yield from self._video(item)
                 continue
@@ -116,33 +117,25 @@ class _Frames(IterableDataset[Batch]):
             if (count - 1) % (world * workers) != rank * workers + number:
                 continue
             if self.records.is_done(item, -1):
-                yield Frame(item, done=True), None
+                yield Entry(item, done=True), None
             else:
-                yield Frame(item), partial(read_image, item.file)
+                yield Entry(item), partial(read_pixels, item.file)
 
-    def _video(self, item: Item) -> Iterator[tuple[Frame, "partial[Tensor] | None"]]:
+    def _video(self, item: Item) -> Iterator[tuple[Entry, Callable[[], Pixels] | None]]:
         rank, world = self.share
         length, every = self.records.length(item), self.records.settings.every
         own = range(rank * every, length or 0, world * every)
         if length is not None and all(self.records.is_done(item, number) for number in own):
-            yield from ((Frame(item, number, done=True), None) for number in own)
-            return
-        try:
-            capture = open_video(item.file)
-        except ValueError as error:  # its name
-            yield Frame(item, failed=str(error)), None
+            yield from ((Entry(item, number, done=True), None) for number in own)
             return
         number = 0
-        while capture.grab():
-            mine = number % every == 0 and number // every % world == rank
-            done = mine and self.records.is_done(item, number)
-            if mine or number < self.records.settings.background_frames:
-                decoded, pixels = capture.retrieve()
-                frame = Frame(item, number, done, "" if decoded else "not decoded", None, mine)
-                yield frame, partial(rgb_from_bgr, pixels) if decoded else None
-            number += 1
-        capture.release()
-        if number == 0:
-            yield Frame(item, failed="not a video, or cut short: no frame could be read"), None
+        try:
+            for number, frame in enumerate(raw_frames(item.file)):
+                mine = number % every == 0 and number // every % world == rank
+                if mine or number < self.records.settings.background_frames:
+                    done = mine and self.records.is_done(item, number)
+                    yield Entry(item, number, done, mine=mine), frame.read
+        except ValueError as error:  # its name, or no frame
+            yield Entry(item, failed=in_one_line(error)), None
         else:
-            yield Frame(item, length=number), None
+            yield Entry(item, length=number + 1), None

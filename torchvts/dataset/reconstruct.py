@@ -28,14 +28,15 @@ from tqdm import tqdm
 
 from ..core import __version__
 from ..core.checks import check_choice, check_integer, check_path, check_sequence, in_one_line
-from ..core.files import IMAGE_SUFFIXES, VIDEO_SUFFIXES, count_frames, cut_short
+from ..core.files import IMAGE_SUFFIXES, VIDEO_SUFFIXES
+from ..core.recordings import count_frames, cut_short, video_codec
 from ..model import Calibration
 from ..pipeline import MODES, DepthOutput, unit_pipeline
 from ..pose.output_frame import MM_OF
 from ..skin import ContactSettings
-from ..stream import FIRST_FRAMES, Recording, check_device, video_codec
+from ..stream import FIRST_FRAMES, Recording, check_device
 from .items import Item, Source, list_items
-from .loading import Frame, load_frames
+from .loading import Entry, load_frames
 from .processes import share, sum_over_processes
 from .records import FORMATS, Records, Settings, begin, join, locked
 from .writing import Writer
@@ -194,7 +195,7 @@ def _check_source(source: Source, out: Path) -> None:
 NAMED = 5
 """So many frames that cannot be used are named at once, by each process; a folder of another sensor's has thousands."""
 
-_Reconstructed = tuple[Frame, Tensor | None, DepthOutput | None]
+_Reconstructed = tuple[Entry, Tensor | None, DepthOutput | None]
 """A frame, its image, and its depth."""
 
 
@@ -219,12 +220,12 @@ class _Worker:
         rank, world = self.share
         source = self.records.source
         items = list_items(source, self.settings.every)
-        total = sum(count_frames(item.file) if item.is_video else 1 for item in items) // world
+        total = sum(count_frames(item.file) if item.is_film else 1 for item in items) // world
         if workers is None:
             cores = (os.cpu_count() or 1) // int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
             workers = 0 if total < 4 * batch else max(1, min(4, cores // 2))
         writers = 1 if self.settings.pictures else 4  # matplotlib draws in one thread only
-        waiting: deque[tuple[Frame, Future[str]]] = deque()
+        waiting: deque[tuple[Entry, Future[str]]] = deque()
         start = time.perf_counter()
         with tqdm(total=total, unit="frame", disable=rank > 0 or None, smoothing=0.05) as bar, ThreadPoolExecutor(writers) as pool:
             for frame, image, output in self._depths(load_frames(self.records, self.sensor, self.share, batch, workers)):
@@ -244,13 +245,13 @@ class _Worker:
         self.writer.write_summary(rows, len(failed), len(doubted))
         return Report(0, rows, rows - done, failed, seconds, self.notes, doubted)
 
-    def _depths(self, loaded: Iterable[tuple[Frame, Tensor | None]]) -> Iterator[_Reconstructed]:
+    def _depths(self, loaded: Iterable[tuple[Entry, Tensor | None]]) -> Iterator[_Reconstructed]:
         """The frames of this rank with image and depth; those of a video once its first frames are there."""
         recording: Recording | None = None
-        held: list[tuple[Frame, Tensor]] = []
+        held: list[tuple[Entry, Tensor]] = []
         video: Item | None = None
         for frame, image in loaded:
-            if not frame.item.is_video or (image is None and frame.length is None):
+            if not frame.item.is_film or (image is None and frame.length is None):
                 if frame.mine:
                     yield self._depth(self.image, frame, image)
                 continue
@@ -270,7 +271,7 @@ class _Worker:
                     self.notes.append((frame.item.path, text))
                 yield frame, None, None
 
-    def _recording(self, item: Item, held: Sequence[tuple[Frame, Tensor]]) -> Recording:
+    def _recording(self, item: Item, held: Sequence[tuple[Entry, Tensor]]) -> Recording:
         """The recording of a video that begins with these frames."""
         count = self.settings.background_frames
         try:
@@ -284,7 +285,7 @@ class _Worker:
             self.notes.append((item.path, f"first frames not used, the calibration is used as it is: {reason}"))
         return self.recording()
 
-    def _depth(self, recording: Recording, frame: Frame, image: Tensor | None) -> _Reconstructed:
+    def _depth(self, recording: Recording, frame: Entry, image: Tensor | None) -> _Reconstructed:
         """Depth of one frame if it is wanted, or why there is none."""
         if image is None:
             return frame, None, None
@@ -299,7 +300,7 @@ class _Worker:
         except ValueError as error:
             return frame._replace(failed=in_one_line(error)), None, None
 
-    def _settle(self, frame: Frame, written: "Future[str]") -> None:
+    def _settle(self, frame: Entry, written: "Future[str]") -> None:
         """Count a frame whose files are in place, or report why there are none."""
         failed = written.result()  # a full disk is an OSError and stops the run
         if failed:
@@ -313,7 +314,7 @@ class _Worker:
         else:
             self.done += frame.length is None
 
-    def _write(self, frame: Frame, image: Tensor | None, result: DepthOutput | None) -> str:
+    def _write(self, frame: Entry, image: Tensor | None, result: DepthOutput | None) -> str:
         """Write a frame's files, then its record; returns why there are none, or an empty text."""
         figures: dict[str, Any] = {"failed": frame.failed}
         if frame.length is not None:

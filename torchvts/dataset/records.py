@@ -217,7 +217,7 @@ class Records:
     def join_videos(self) -> None:
         """Make one npz of the frames of each video, where that is asked for."""
         for item in list_items(self.source):
-            length = self.length(item) if item.is_video else None
+            length = self.length(item) if item.is_film else None
             if self.settings.format != VIDEO_FORMAT or length is None:
                 continue
             records = ((frame, self.read(item, frame)) for frame in range(0, length, self.settings.every))
@@ -233,7 +233,7 @@ class Records:
 
     def _rows(self, item: Item) -> Iterator[tuple[str, Record | None]]:
         frames: Iterable[int] = (-1,)
-        if item.is_video and (length := self.length(item)) is not None:
+        if item.is_film and (length := self.length(item)) is not None:
             frames = range(0, length, self.settings.every)
         return ((item.frame_name(frame), self.read(item, frame)) for frame in frames)
 

@@ -16,7 +16,7 @@ from ..model.report import warnings_of
 from ..pipeline import DepthOutput
 from ..pose import OutputFrame, write_point_cloud
 from ..pose.surface_files import write_obj
-from .loading import Frame
+from .loading import Entry
 from .records import VIDEO_FORMAT, Records
 
 
@@ -30,7 +30,7 @@ class Writer:
         self.frame = OutputFrame(records.settings.length_unit, unit.sensor)
         self.exaggeration: float | None = None  # of heights in all pictures, known from the first contact on
 
-    def write(self, frame: Frame, image: Tensor, result: DepthOutput) -> None:
+    def write(self, frame: Entry, image: Tensor, result: DepthOutput) -> None:
         """All files of a frame: its depth, its contact, its picture."""
         pitch, name = self.sensor.mm_per_pixel, frame.item.frame_name(frame.number)
         stem, path = self.records.out / frame.item.frame_stem(frame.number), self.records.result_file(frame.item, frame.number)

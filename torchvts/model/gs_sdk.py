@@ -17,7 +17,8 @@ import torch
 from torch import Tensor
 
 from ..core.checks import brief, check_batch, check_float_tensor, check_path, check_positive, check_tensor, parse_number
-from ..core.files import image_files, png_size, read_image, rgb_from_bgr
+from ..core.files import png_size, read_image, rgb_from_bgr
+from ..core.recordings import image_files
 from ..core.strict_yaml import read_yaml
 from .gs_sdk_sensor import values_from_gs_sdk
 from .sensor import Sensor

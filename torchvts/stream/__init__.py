@@ -14,13 +14,13 @@ from .background import (
 from .cameras import Camera, CameraSettings
 from .devices import find_camera
 from .files import StreamReport
-from .frames import NewestFrame
 from .keys import Keys
 from .live import TactileFrame, TactileStream
+from .numbered import NewestFrame
 from .overlay import Overlay, Sheet
 from .record import Recorder
 from .recording import Recording, check_device
-from .sources import Reader, Unreadable, frames_a_second, open_source, video_codec
+from .sources import Reader, Unreadable, frames, open_source
 from .stages import StageClock
 from .usable import FrameCheck
 from .video import VideoFile
@@ -50,7 +50,7 @@ __all__ = [
     "check_device",
     "find_background",
     "find_camera",
-    "frames_a_second",
+    "frames",
     "has_screen",
     "messages",
     "open_source",
@@ -58,6 +58,5 @@ __all__ = [
     "read_press_images",
     "require_rerun",
     "use_calibration",
-    "video_codec",
     "with_background",
 ]

@@ -21,11 +21,11 @@ from ..calibration import (
 from ..core.blur import band_of_ratios, without_margin
 from ..core.cells import whole_cell_means
 from ..core.checks import check_batch, check_image, check_integer, check_path, check_positive, check_sequence, parse_number
-from ..core.files import VIDEO_SUFFIXES, read_frames
+from ..core.recordings import is_film, video_codec
 from ..model import Calibration, Sensor, SensorPrior, check_calibration, check_sensor
 from ..model.calibration import PEDESTAL
 from ..normals import NormalFromResponse
-from .sources import video_codec
+from .sources import frames
 
 MOVED = 0.02
 """Relative change of a cell of 1/20 of the frame that counts as movement among the first frames."""
@@ -128,7 +128,7 @@ def read_background(paths: Sequence[str | Path], sensor: Sensor, first_frames: i
 
     * One image: as it is.
     * Several images: the median of each pixel. Contacts vanish from it where each pixel is free of contact in most of the images.
-    * A video: its first frames, by :func:`find_background`, which refuses those with contact.
+    * A video, or a TIFF of several pages: its first frames, by :func:`find_background`, which refuses those with contact.
 
     Args:
         paths: one or more images, or one video.
@@ -143,7 +143,7 @@ def read_background(paths: Sequence[str | Path], sensor: Sensor, first_frames: i
     if len(paths) == 0:
         raise ValueError("background: expected one image or more, or a video, got none")
     files = [check_path("background", path) for path in paths]
-    if any(file.suffix.lower() in VIDEO_SUFFIXES for file in files):
+    if any(is_film(file) for file in files):
         if len(files) > 1:
             raise ValueError(f"background: expected images or one video, got {len(files)} files with a video among them")
         return _background_of_video(files[0], sensor, first_frames)
@@ -156,10 +156,10 @@ def read_background(paths: Sequence[str | Path], sensor: Sensor, first_frames: i
 
 def _background_of_video(path: Path, sensor: Sensor, first_frames: int) -> Tensor:
     try:
-        frames = [sensor.rectify(frame[None]).clamp(0.0, 1.0) for _, frame in islice(read_frames(path), first_frames)]
-        if len(frames) < first_frames:
-            raise ValueError(f"background: expected at least {first_frames} frames, got {len(frames)}: ask for fewer")
-        return find_background(torch.cat(frames), sensor, video_codec(path))
+        first = [sensor.rectify(image[None]).clamp(0.0, 1.0) for _, image in islice(frames(path), first_frames)]
+        if len(first) < first_frames:
+            raise ValueError(f"background: expected at least {first_frames} frames, got {len(first)}: ask for fewer")
+        return find_background(torch.cat(first), sensor, video_codec(path))
     except ValueError as error:
         raise ValueError(str(error) if str(error).startswith(str(path)) else f"{path}: {error}") from error
 

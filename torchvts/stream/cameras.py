@@ -5,7 +5,8 @@ import warnings
 from typing import NamedTuple
 
 from ..core.checks import check_integer, check_positive
-from .sources import CaptureReader, lossy_codec
+from ..core.recordings import lossy_codec
+from .sources import CameraReader
 
 
 class CameraSettings(NamedTuple):
@@ -29,7 +30,7 @@ class CameraSettings(NamedTuple):
         return any(value is not None for value in self)
 
 
-class Camera(CaptureReader):
+class Camera(CameraReader):
     """A camera with settings; what the driver does not take is warned of.
 
     Where it does not take size or rate, as an uncompressed format may not allow them, they are asked for in MJPG.

@@ -12,6 +12,7 @@ from torch import Tensor
 from ..calibration import Press
 from ..core.checks import check_choice, check_integer, check_least, check_record, check_switch
 from ..core.files import rgb_from_bgr
+from ..core.recordings import Pixels
 from ..model import Calibration, Sensor
 from ..pipeline import MODES, Conditions, DepthOutput
 from ..skin import ContactSettings
@@ -23,10 +24,10 @@ from .background import (
     use_calibration,
     with_background,
 )
-from .frames import SourceFrames
+from .numbered import SourceFrames
 from .record import Recorder
 from .recording import NotAtRest, Recording
-from .sources import Pixels, Reader, Unreadable, check_reader, open_source
+from .sources import Reader, Unreadable, check_reader, open_source
 from .stages import StageClock
 
 UNKNOWN_LIGHT = (

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from ..core.checks import check_positive
+from ..core.recordings import Pixels
 from .live import TactileFrame
-from .sources import Pixels
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -1,21 +1,31 @@
 """Reads frames of cameras, videos and folders of images."""
 
 import queue
+import sys
 import threading
 import time
 import warnings
-from collections.abc import Callable, Sequence
-from itertools import pairwise
+from collections.abc import Callable, Iterator, Sequence
+from itertools import chain, pairwise
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
-import numpy as np
+from torch import Tensor
 
 from ..core.checks import brief, check_integer, check_least, check_path, check_positive, parse_number
-from ..core.files import IMAGE_SUFFIXES, VIDEO_SUFFIXES, check_text_name, cut_short, image_files, open_video, read_pixels
+from ..core.files import IMAGE_SUFFIXES, VIDEO_SUFFIXES, check_text_name, rgb_from_bgr
+from ..core.recordings import (
+    Pixels,
+    RawFrame,
+    cut_short,
+    frames_a_second,
+    image_files,
+    lossy_codec,
+    raw_frames,
+    video_codec,
+    video_rate,
+)
 from .devices import find_camera, found_cameras
-
-Pixels = np.ndarray[Any, Any]
 
 MOST_CAMERAS = 99
 """Largest index of a camera: OpenCV takes the hundreds as the number of a driver, and crashes on negative ones."""
@@ -34,9 +44,6 @@ SETTLING = 5
 
 MOST_FPS = 1e5
 """No camera gives more frames a second."""
-
-ASSUMED_FPS = 30.0
-"""Frames a second of images that say nothing of their times."""
 
 
 class Unreadable(NamedTuple):
@@ -72,19 +79,16 @@ class Reader(Protocol):
         """Release the device or file."""
 
 
-class CaptureReader:
-    """A camera (an index), a network camera (a URL) or a video file, by OpenCV."""
+class CameraReader:
+    """A camera (an index) or a network camera (a URL), by OpenCV."""
 
-    def __init__(self, source: int | str | Path) -> None:
+    live = True
+
+    def __init__(self, source: int | str) -> None:
         import cv2
 
-        self.live = not isinstance(source, Path)
-        self.name = f"camera {source}" if isinstance(source, int) else str(source)
-        self.times = list(read_times(source).values()) if isinstance(source, Path) else []
-        if isinstance(source, Path):
-            self._capture = open_video(source)
-        else:
-            self._capture = cv2.VideoCapture(source if isinstance(source, int) else check_text_name("source", source))
+        self.name = f"camera {source}" if isinstance(source, int) else source
+        self._capture = cv2.VideoCapture(source if isinstance(source, int) else check_text_name("source", source))
         if not self._capture.isOpened():
             self._capture.release()
             if isinstance(source, int):
@@ -92,26 +96,13 @@ class CaptureReader:
                     f"source: expected a camera with index {source}, got none that opens: plugged in? in use elsewhere? "
                     f"{found_cameras()}"
                 )
-            if self.live:
-                raise OSError(
-                    f"source: expected a network camera at {source}, got none that opens: is it on? is the address right?"
-                )
-            raise ValueError(f"source: {source}: not a video, or cut short: it does not open")
-        if self.live:
-            self._capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
-        self.fps = rate_of(self.times, frames_a_second(self._capture))
-        self.codec = lossy_codec(self._capture)
-        self._file, self._count = source if isinstance(source, Path) else None, 0
+            raise OSError(f"source: expected a network camera at {source}, got none that opens: is it on? is the address right?")
+        self._capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
+        self.fps, self.codec = frames_a_second(self._capture), lossy_codec(self._capture)
 
     def read(self) -> Pixels | None:
         there, pixels = self._capture.read()
-        if there:
-            self._count += 1
-            return pixels  # type: ignore[no-any-return]
-        if self._file is not None and (text := cut_short(self._file, self._count)):
-            warnings.warn(f"{self.name}: {text}", stacklevel=2)
-        self._file = None
-        return None
+        return pixels if there else None
 
     def close(self) -> None:
         self._capture.release()
@@ -239,14 +230,6 @@ class _ReadingThread:
             self._thread.join(timeout=2.0)
 
 
-def frames_a_second(capture: Any) -> float:
-    """Rate of an OpenCV capture; :data:`ASSUMED_FPS` where it does not know."""
-    import cv2
-
-    fps = float(capture.get(cv2.CAP_PROP_FPS))
-    return fps if 0.5 <= fps <= 1000.0 else ASSUMED_FPS
-
-
 def times_file(recording: Path) -> Path:
     """The table of the times of a recording's frames: in a folder, beside a video."""
     return recording / "times.csv" if recording.is_dir() else Path(f"{recording}.times.csv")
@@ -281,64 +264,82 @@ def time_of(index: int, fps: float, times: Sequence[float]) -> float:
     return times[index] if index < len(times) else index / fps
 
 
-CODECS = {
-    **dict.fromkeys(("FMP4", "mp4v", "XVID", "DIVX", "DX50", "MP42", "MP43"), "MPEG-4"),
-    **dict.fromkeys(("h264", "H264", "avc1", "X264"), "H.264"),
-    **dict.fromkeys(("hevc", "HEVC", "hvc1", "hev1"), "H.265"),
-    **dict.fromkeys(("MJPG", "mjpg"), "Motion JPEG"),
-    **dict.fromkeys(("FFV1", "HFYU", "FFVH", "MPNG", "png ", "I420", "YUY2", "YUYV", "\0\0\0\0"), ""),
-}
-"""OpenCV's codes of codecs, and the names of those that lose something; others are shown by their code."""
+class FileReader:
+    """A recording: a video, an image, a TIFF of several pages, or a folder of images by name, numbers as numbers."""
 
+    live = False
 
-def lossy_codec(capture: Any) -> str:
-    """Name of the codec of an OpenCV capture; empty where it loses nothing, or is not known."""
-    import cv2
-
-    code = int(capture.get(cv2.CAP_PROP_FOURCC))
-    letters = max(code, 0).to_bytes(8, "little")[:4].decode("latin-1")
-    return CODECS.get(letters, letters)
-
-
-def video_codec(path: Path) -> str:
-    """:func:`lossy_codec` of a video file."""
-    capture = open_video(path)
-    try:
-        return lossy_codec(capture)
-    finally:
-        capture.release()
-
-
-class FolderReader:
-    """A folder of images, by name, numbers as numbers."""
-
-    def __init__(self, folder: Path) -> None:
-        self.name, self.live = str(folder), False
-        files = image_files(folder)
-        if not files:
-            raise ValueError(
-                f"source: expected a folder of images ({', '.join(IMAGE_SUFFIXES)}), got {folder}: no images in this folder"
-            )
-        self._files, known = iter(files), read_times(folder)
-        self.times = [known[file.stem] for file in files] if all(file.stem in known for file in files) else []
-        self.fps = rate_of(self.times, ASSUMED_FPS)
-        self.codec = "JPEG" if files[0].suffix.lower() in (".jpg", ".jpeg") else ""
+    def __init__(self, path: Path) -> None:
+        self.name, known = str(path), read_times(path)
+        self._path, self._count = path, 0
+        try:
+            frames = raw_frames(path)
+            first = next(frames)
+        except ValueError as error:
+            raise ValueError(f"source: {error}") from error
+        self._frames: Iterator[RawFrame] = chain((first,), frames)
+        names = [file.stem for file in image_files(path)] if path.is_dir() else list(known)
+        self.times = [known[name] for name in names] if all(name in known for name in names) else []
+        self.fps, self.codec = rate_of(self.times, video_rate(path)), video_codec(path)
+        self.fps_assumed = not self.times and path.suffix.lower() not in VIDEO_SUFFIXES
 
     def read(self) -> Pixels | Unreadable | None:
-        path = next(self._files, None)
-        if path is None:
+        frame = next(self._frames, None)
+        if frame is None:
+            if self._count and (text := cut_short(self._path, self._count)):
+                warnings.warn(f"{self.name}: {text}", stacklevel=2)
+            self._count = 0
             return None
+        self._count += 1
         try:
-            return read_pixels(path)
+            return frame.read()
         except (ValueError, OSError) as error:
             return Unreadable(str(error))
 
     def close(self) -> None:
-        self._files = iter(())
+        self._frames = iter(())
+
+
+def frames(source: str | int | Path) -> Iterator[tuple[str, Tensor]]:
+    """The frames of an image, a folder of images, a TIFF of several pages, a video or a camera: pairs of a name and an image.
+
+    Images are (3, H, W) float32 in [0, 1], R, G, B, as they are: ``sensor.rectify`` cuts them. A camera gives all its frames, until
+    it stops or nobody asks.
+
+    Args:
+        source: a path; or a camera by its index, name, path or URL, as :func:`open_source` takes it.
+    Raises:
+        FileNotFoundError: no such file or folder, and no such camera.
+        ValueError: no images in the folder; while frames are asked for: a file that cannot be read.
+        OSError: no such camera, or it has stopped.
+    Example:
+        >>> import tempfile, torch, torchvts as vts
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     for k in range(2):
+        ...         vts.write_image(f"{folder}/{k}.png", torch.full((3, 4, 6), 0.5 * k))
+        ...     [(name, image.shape) for name, image in vts.frames(folder)]
+        [('0', torch.Size([3, 4, 6])), ('1', torch.Size([3, 4, 6]))]
+    """
+    path = None if isinstance(source, int) else check_path("source", source)
+    if path is not None and path.exists() and find_camera(str(path)) is None:
+        return ((frame.name, rgb_from_bgr(frame.read())) for frame in raw_frames(path))
+    return _of_camera(open_source(source))
+
+
+def _of_camera(reader: Reader) -> Iterator[tuple[str, Tensor]]:
+    try:
+        for number in range(-SETTLING, sys.maxsize):
+            pixels = reader.read()
+            if pixels is None:
+                return
+            if number >= 0 and not isinstance(pixels, Unreadable):
+                yield f"{number:06d}", rgb_from_bgr(pixels)
+    finally:
+        reader.close()
 
 
 def open_source(source: str | int | Path, reconnect_s: float = 0.0) -> Reader:
-    """Open a camera (:func:`find_camera`), a network camera by its URL, a video file, or a folder of images.
+    """Open a camera (:func:`find_camera`), a network camera by its URL, a video, an image or TIFF, or a folder of images.
 
     Args:
         source: what to open.
@@ -351,27 +352,28 @@ def open_source(source: str | int | Path, reconnect_s: float = 0.0) -> Reader:
     check_least("reconnect_s", reconnect_s)
     if isinstance(source, int) and not isinstance(source, bool):
         index = check_integer("source", source, 0, MOST_CAMERAS)
-        return LiveReader(lambda: CaptureReader(index), reconnect_s)
+        return LiveReader(lambda: CameraReader(index), reconnect_s)
     text = str(check_path("source", source))
     if text.isascii() and text.isdigit():
         if len(text) > 9 or int(text) > MOST_CAMERAS:
             raise ValueError(f"source: expected a camera's index of at most {MOST_CAMERAS}, got {brief(text)}")
-        return LiveReader(lambda: CaptureReader(int(text)), reconnect_s)
+        return LiveReader(lambda: CameraReader(int(text)), reconnect_s)
     if isinstance(source, str) and source.lower().startswith(URLS):
-        return LiveReader(lambda: CaptureReader(source), reconnect_s)
+        return LiveReader(lambda: CameraReader(source), reconnect_s)
     path = Path(text)
     if path.is_dir():
-        return FolderReader(path)
+        return FileReader(path)
     if find_camera(text) is not None:
-        return LiveReader(lambda: CaptureReader(_index_of(text)), reconnect_s)  # found again: it may come back as another
+        return LiveReader(lambda: CameraReader(_index_of(text)), reconnect_s)  # found again: it may come back as another
     if not path.is_file():
         raise FileNotFoundError(
             "source: expected a file, a folder, a URL, or a camera by index, /dev path, name or serial number, "
             f"got {text}: no such file or folder, and no such camera; {found_cameras()}"
         )
-    if path.suffix.lower() not in VIDEO_SUFFIXES:
-        raise ValueError(f"source: {path}: expected a video ({', '.join(VIDEO_SUFFIXES)}), a folder of images or a camera's index")
-    return CaptureReader(path)
+    known = VIDEO_SUFFIXES + IMAGE_SUFFIXES
+    if path.suffix.lower() not in known:
+        raise ValueError(f"source: {path}: expected a video or an image ({', '.join(known)}), a folder or a camera's index")
+    return FileReader(path)
 
 
 def _index_of(text: str) -> int:

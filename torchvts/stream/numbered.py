@@ -8,8 +8,9 @@ from typing import Any
 
 from ..core.checks import check_positive
 from ..core.files import check_pixels
+from ..core.recordings import Pixels
 from .record import Recorder
-from .sources import MOST_FPS, SETTLING, LiveReader, Pixels, Reader, Unreadable, time_of
+from .sources import MOST_FPS, SETTLING, LiveReader, Reader, Unreadable, time_of
 from .stages import StageClock
 
 NumberedFrame = tuple[int, float, Pixels | Unreadable]

@@ -13,8 +13,8 @@ import torchvts as vts
 from lab.commands import main_of, parser_of
 from lab.pose_accuracy import PoseCase, ball_pairs, pose_table, run_poses
 from lab.rows import to_json, write_files
+from lab.timing import machine
 from torchvts import viz
-from torchvts.cli.bench import machine
 from torchvts.pose import Registration, contact_cloud
 from torchvts.scenes import objects
 

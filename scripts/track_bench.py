@@ -19,7 +19,7 @@ from tqdm import tqdm
 from lab import tracking
 from lab.commands import main_of, parser_of
 from lab.rows import to_json, write_files
-from torchvts.cli.bench import machine
+from lab.timing import machine
 
 
 def main(argv: Sequence[str] | None = None) -> int:

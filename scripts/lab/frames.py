@@ -18,7 +18,6 @@ from torch import Tensor, nn
 import torchvts
 from torchvts import export
 from torchvts.calibration import Press, calibrate, read_presses
-from torchvts.cli.bench import CAMERA_S, SIZES, in_turn, machine, rig
 from torchvts.core.tables import markdown, number
 from torchvts.model import Calibration, Sensor, gs_sdk
 from torchvts.normals import NormalFromMLP
@@ -28,6 +27,7 @@ from .latency import measure_latency
 from .peers import peer_frame
 from .rows import Row, Size, Time
 from .speed import GS_SDK, PACES, Progress, memory_mb, ms, size_text, time_of
+from .timing import CAMERA_S, SIZES, in_turn, machine, rig
 
 USED = ("fast", "precise")
 """Modes of frames as a user runs them."""

@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from torchvts.calibration import RESPONSE_BLUR_PX, Press, fit_prior, read_presses
+from torchvts.cli.options import cut_frames
 from torchvts.compensate import Compensate
 from torchvts.core.checks import check_image, check_integer
 from torchvts.core.files import read_image, rgb_from_bgr
@@ -113,7 +114,7 @@ def from_folder(
         ValueError: too few presses, or none that can be scored.
         FileNotFoundError: no such folder or file.
     """
-    background, presses = read_presses(folder)
+    background, presses = cut_frames(*read_presses(folder), sensor)
     check_image("background", background, sensor.height, sensor.width, sensor.name)
     if network is not None:
         NormalFromMLP.load(network, background)  # a bad one is refused before the work, also where no method needs it

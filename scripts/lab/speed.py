@@ -10,7 +10,6 @@ from pathlib import Path
 import torch
 
 from torchvts.calibration import Press, read_presses
-from torchvts.cli.bench import SIZES, in_turn, machine, rig
 from torchvts.core.tables import number
 from torchvts.model import Sensor
 from torchvts.normals import NormalFromMLP
@@ -24,6 +23,7 @@ from .metrics import depth_error, normal_angle_deg
 from .peers import GsSdkPipeline, peer_frame
 from .rows import Column, Row, Size, Time, error_column, mean
 from .score import score_press
+from .timing import SIZES, in_turn, machine, rig
 
 GS_SDK = "gs_sdk's pipeline"
 

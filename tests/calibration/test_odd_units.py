@@ -13,8 +13,8 @@ import torch
 import torchvts as vts
 from torchvts.calibration.doubts import of_type
 from torchvts.calibration.given_images import colour_share, colour_variation
-from torchvts.cli.summary import expected
 from torchvts.model.response_field import CHANGE_SCALE, ResponseField, ResponseModel, SensorPrior, fit_log_background
+from torchvts.model.summary import expected
 from torchvts.stream import use_calibration
 
 HEIGHT, WIDTH, PITCH = 90, 120, 0.15

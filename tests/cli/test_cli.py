@@ -12,7 +12,7 @@ import torch
 import torchvts as vts
 from torchvts.cli import COMMANDS, main
 from torchvts.cli.calibrate import warn_of_a_small_place
-from torchvts.cli.summary import SHOWN, expected, left_out
+from torchvts.model.summary import SHOWN, expected, left_out
 
 
 @pytest.mark.parametrize("name", COMMANDS)
@@ -59,8 +59,6 @@ def test_the_module_is_the_command_and_loads_no_more_than_it_needs():
         (["calibrate", "a.png", "--sensor", "digit", "--gamma", "2.2"], "--gamma: expected it beside --mm-per-pixel"),
         (["calibrate", "a.png", "--sensor", "digit", "--out", "unit.npz"], "expected a name ending in .safetensors"),
         (["stream", "--source", "0"], "expected either --sensor or --calibration"),
-        (["evaluate"], "the following arguments are required: FOLDER"),
-        (["evaluate", "presses"], "expected --sensor"),
         (["samples", "gelsight_maxi"], "did you mean 'gelsight_mini'?"),
     ],
 )

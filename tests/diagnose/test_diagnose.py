@@ -226,7 +226,7 @@ CLIPPED = "gelsight_pale"
 
 @pytest.mark.parametrize("name", [pytest.param(s, marks=() if s in QUICK else pytest.mark.long) for s in sets.REAL])
 def test_ordinary_frames_of_real_sensors_raise_no_alarm(name, data):
-    """Calibrated as ``torchvts evaluate`` does: by some presses, and others as frames; and the background itself."""
+    """Calibrated as ``scripts/accuracy.py`` does: by some presses, and others as frames; and the background itself."""
     found_set = sets.load(name, data, 6 if name in QUICK else None)
     if found_set.refused:
         pytest.skip(f"{name}: no calibration, and that is right")

@@ -14,7 +14,6 @@ import torchvts as vts
 from lab import evaluate as ev
 from lab import methods, rows, sets
 from lab.score import score_press
-from torchvts.cli import main
 from torchvts.core.geometry import normal_from_gradient
 from torchvts.model.gs_sdk import CATALOG_COLUMNS, LABEL_COLUMNS
 from torchvts.training import presses as presses_room
@@ -227,61 +226,11 @@ def test_training_knows_presses_by_their_place_not_by_their_name(folder, monkeyp
     assert learned[0].center_px == presses[0].center_px and learned[-1].contact_radius_px is not None
 
 
-@pytest.fixture(scope="module")
-def by_hand(folder):
-    """The score of each press of the folder, mode precise, by the scores of the lab."""
-    sensor = vts.Sensor.load(folder / "rig.yaml")
-    result = ev.evaluate(sets.from_folder(folder, sensor, folds=3), ["fast", "precise"])
-    return {(score.press, score.method): score for score in result.scores}
-
-
-def test_own_presses_are_scored_as_the_lab_scores_them(run_script, folder, by_hand, tmp_path):
-    done = run_script("evaluate", folder, "--sensor", folder / "rig.yaml", "--folds", 3, "--out", tmp_path)
-    assert done.returncode == 0, done.stderr
-    with (tmp_path / "presses.csv").open(newline="") as stream:
-        lines = list(csv.DictReader(stream))
-    assert len(lines) == len(by_hand) == 10  # five presses with a contact radius, two modes, each press once
-    for line in lines:
-        score = by_hand[line["press"], line["mode"]]
-        for name in ("normal_deg", "relief_um", "radius_percent"):
-            assert float(line[name]) == pytest.approx(getattr(score, name), rel=1e-9)
-    assert "6 presses, 6 labelled; fold 3 of 3" in done.stdout
-    assert done.stderr.splitlines()[-1] == "fold 3 of 3: 5 presses scored"  # no terminal: a line a fold
-    assert done.stdout.splitlines()[2].startswith("| fast | ") and (tmp_path / "table.md").read_text() in done.stdout + "\n"
-
-
-def test_camera_frames_are_cut_as_calibrate_cuts_them(folder, tmp_path, capsys):
+def test_camera_frames_are_cut_as_calibrate_cuts_them(folder, tmp_path):
     """Frames of which the sensor file's region is a part; their labels are of cut frames, so the balls are found."""
     raw = shutil.copytree(folder, tmp_path / "raw")
     for path in raw.rglob("*.png"):
         vts.write_image(path, torch.nn.functional.pad(vts.read_image(path), (9, 5, 4, 6)))
-    vts.Sensor("rig", HEIGHT, WIDTH, PITCH, gamma=1.0, roi_px=(9, 4, WIDTH, HEIGHT)).save(raw / "rig.yaml")
-    assert main(["evaluate", str(raw), "--sensor", str(raw / "rig.yaml"), "--folds", "2", "--out", str(tmp_path / "out")]) == 0
-    assert "6 presses, 0 labelled" in capsys.readouterr().out
-
-
-def test_what_was_scored_stays_where_it_is_stopped(folder, monkeypatch, tmp_path, capsys):
-    made = Training.calibration
-    attempts = []
-
-    def stopped_at_the_third(self):
-        attempts.append(1)
-        if len(attempts) == 3:
-            raise KeyboardInterrupt
-        return made.fget(self)
-
-    monkeypatch.setattr(Training, "calibration", property(stopped_at_the_third))
-    arguments = [str(folder), "--sensor", str(folder / "rig.yaml"), "--folds", "3", "--out", str(tmp_path)]
-    assert main(["evaluate", *arguments]) == 130
-    assert "fold 2 of 3" in capsys.readouterr().out
-    names = [line.split(",")[0] for line in (tmp_path / "presses.csv").read_text().splitlines()[1:]]
-    assert names == [name for k in (0, 3, 1, 4) for name in [f"ball/{k}"] * 2]
-
-
-def test_a_fold_that_cannot_be_calibrated_is_named(folder, monkeypatch, tmp_path, capsys):
-    monkeypatch.setattr(presses_room, "calibrate", FailingUnit)
-    arguments = [str(folder), "--sensor", str(folder / "rig.yaml"), "--folds", "2", "--out", str(tmp_path)]
-    assert main(["evaluate", *arguments]) == 2
-    assert "fold 1: presses: no contact| in any of them" in capsys.readouterr().err
-    assert main(["evaluate", *arguments[:-3], "7", *arguments[-2:]]) == 2
-    assert "--folds: expected at most the number of presses, 6, got 7" in capsys.readouterr().err
+    sensor = vts.Sensor("rig", HEIGHT, WIDTH, PITCH, gamma=1.0, roi_px=(9, 4, WIDTH, HEIGHT))
+    read = sets.from_folder(raw, sensor, folds=2)
+    assert read.background.shape == (3, HEIGHT, WIDTH) and "centers from calibrate" in read.how

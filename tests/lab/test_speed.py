@@ -8,7 +8,6 @@ import pytest
 from lab import rows, speed
 from lab.methods import METHODS
 from lab.rows import Row, Size, Time
-from torchvts.cli import bench
 
 
 def row(method, ms, rms_um, kind="scene", height=480, data="sphere R 10 mm, press 1 mm, noise 0.003"):
@@ -59,17 +58,3 @@ def test_a_chart_is_drawn_again_from_its_table(run_script, tmp_path):
     assert done.returncode == 0 and (tmp_path / "overview.png").stat().st_size > 10_000
     done = run_script("figures", "speed", tmp_path / "none.json", tmp_path / "chart.png")
     assert done.returncode == 1 and done.stderr.startswith("error: ") and "none.json" in done.stderr
-
-
-def test_the_command_prints_a_line_for_each_size_and_mode(run_script, monkeypatch):
-    monkeypatch.setattr(bench, "SIZES", ((24, 32), (48, 64)))
-    monkeypatch.setattr(bench, "BATCHED", (48, 64))
-    done = run_script("bench", "--calls", 4, "--threads", 1)
-    assert done.returncode == 0, done.stderr
-    lines = [[cell.strip() for cell in line.split("|")[1:-1]] for line in done.stdout.splitlines()[2:7]]
-    assert [line[:2] for line in lines] == [
-        ["32x24", "fast"], ["32x24", "precise"], ["64x48", "fast"], ["64x48", "precise"], ["64x48, batch 16", "fast"]
-    ]  # fmt: skip
-    assert all(float(line[3]) > 0.0 for line in lines) and "1 threads allowed" in done.stdout
-    assert done.stderr.splitlines()[0] == "measured: 32x24, fast"  # no terminal: a line a row
-    assert run_script("bench", "--calls", 0).returncode == 2

@@ -20,11 +20,11 @@ from ..calibration import Press, read_presses
 from ..calibration.presses import check_presses
 from ..core.files import make_folder
 from ..model import Sensor
+from ..model.summary import summary_of
 from ..stream import frames, read_background, read_press_images
 from ..viz import calibration_figure, save_figure
-from .options import add_background_frames, add_press, add_sensor, cut_frames, load_sensor
+from .options import add_background_frames, add_press, add_sensor, calibrated, cut_frames, load_sensor
 from .parser import UsageError
-from .summary import calibrated, print_calibration
 
 SMALL_PLACE = 0.3
 """Share of the camera's frame: gels take 0.42 and more; places measured in a preview of half the size at most a quarter."""
@@ -64,7 +64,7 @@ def run(arguments: argparse.Namespace) -> int:
     calibration.save(arguments.out)
     picture = arguments.out.with_suffix(".png")
     save_figure(calibration_figure(calibration, check_presses(presses, sensor)), picture)
-    print_calibration(calibration, arguments.candidates)
+    print(summary_of(calibration, arguments.candidates))
     print(f"wrote {arguments.out} ({arguments.out.stat().st_size / 1000:.0f} kB), and {picture}: what it was made of")
     return 0
 

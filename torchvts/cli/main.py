@@ -27,9 +27,7 @@ COMMANDS = {
     "diagnose": "what is wrong with a frame or its calibration",
     "export": "files that run without torchvts: TorchScript, ONNX and others",
     "train": "train gs_sdk's network on presses of balls",
-    "evaluate": "score your own presses of balls by held-out calibrations",
     "samples": "images of a real sensor to try the commands on",
-    "bench": "measure the frames a second of this machine",
 }
 """Subcommand: what it does. Its module has its name; it is imported only where it is asked for."""
 

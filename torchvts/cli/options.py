@@ -1,13 +1,15 @@
 """Options that several subcommands share, each defined once."""
 
 import argparse
+import sys
+import warnings
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 
 from torch import Tensor
 
-from ..calibration import Press
+from ..calibration import CalibrationWarning, Press, calibrate
 from ..core.checks import parse_number
 from ..core.spelling import suggest
 from ..model import Calibration, Sensor, shipped_sensors
@@ -125,3 +127,14 @@ def add_out(parser: argparse._ActionsContainer, text: str, default: str | None =
     """``--out``: where results go; required where there is no default."""
     path = None if default is None else Path(default)
     parser.add_argument("--out", type=Path, metavar="FOLDER", required=default is None, default=path, help=text)
+
+
+def calibrated(background: Tensor, sensor: Sensor, presses: Sequence[Press], force: bool = False) -> Calibration:
+    """:func:`torchvts.calibrate`; warnings become lines on stderr, save the doubts, which the summary prints."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", CalibrationWarning)
+        calibration = calibrate(background, sensor, presses, progress=True, force=force)
+    for text in dict.fromkeys(str(warning.message) for warning in caught):
+        if text not in calibration.report.get("doubts", []):
+            print(f"torchvts: warning: {text}", file=sys.stderr)
+    return calibration

@@ -24,7 +24,8 @@ from ..dataset import CLOUD_FORMATS, FORMATS, PICTURES_UP_TO, Report, list_items
 from ..diagnose import Finding, diagnose
 from ..model import Calibration
 from ..model.report import warnings_of
-from ..stream import NOT_METRIC, frames, read_background, read_press_images
+from ..model.summary import NOT_METRIC, SHOWN, doubts_of
+from ..stream import frames, read_background, read_press_images
 from .options import (
     add_background_frames,
     add_length_unit,
@@ -32,12 +33,12 @@ from .options import (
     add_pipeline,
     add_press,
     add_sensor,
+    calibrated,
     contact_of,
     load_calibration,
     load_sensor,
 )
 from .parser import UsageError
-from .summary import SHOWN, calibrated, print_calibration, print_doubts
 
 PASSED = (
     "mode", "format", "cloud", "length_unit", "pictures", "every", "network", "device", "background_frames", "batch", "workers",
@@ -119,7 +120,7 @@ def calibrate_first(arguments: argparse.Namespace, inputs: list[Path]) -> Path:
     unit = load_sensor(arguments.sensor)
     image = read_background(arguments.background or [video], unit, arguments.background_frames)
     calibration = calibrated(image, unit, read_press_images(arguments.press, unit))
-    print_calibration(calibration)
+    print(calibration)
     path: Path = arguments.out / "calibration.safetensors"
     make_folder(path.parent)
     calibration.save(path)
@@ -131,7 +132,7 @@ def print_unit(unit: Calibration) -> None:
     if not unit.metric:
         print(NOT_METRIC)
     if warnings_of(unit.report):
-        print_doubts(unit.report)
+        print(*doubts_of(unit.report), sep="\n")
 
 
 def print_report(report: Report, out: Path, metric: bool) -> None:

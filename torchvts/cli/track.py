@@ -29,9 +29,10 @@ from torch import Tensor
 from ..core.checks import check_positive
 from ..core.files import check_folder, make_folder, read_image, write_atomically
 from ..core.recordings import Pixels
+from ..model.summary import NOT_METRIC
 from ..pose import OutputFrame, PoseTracker, TrackedPose
 from ..pose.follow import TRUSTED_DEG, TRUSTED_MM
-from ..stream import NOT_METRIC, LiveView, Overlay, TactileFrame, TactileStream, VideoFile, has_screen
+from ..stream import LiveView, Overlay, TactileFrame, TactileStream, VideoFile, has_screen
 from ..stream.files import summary_of
 from ..stream.view import AXIS_COLOURS
 from .options import add_length_unit, add_out

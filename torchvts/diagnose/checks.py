@@ -10,6 +10,7 @@ import torch
 from ..calibration import ROUGH, channel_structure
 from ..core.frame import Conditions
 from ..model.stated_error import stated_deg, stated_error_deg
+from ..model.summary import SATURATED_SHARE
 from ..pipeline import UNEVEN, UNSEEN_DEG, DepthPipeline, light_levels, light_unevenness
 from ..stream import FrameCheck
 from .camera import blockiness, levels_of, new_spots, pattern_likeness, texture_share
@@ -34,9 +35,6 @@ BEYOND = 2.0
 BLOCKY = 1.18
 """Ratio of steps at the borders of 8 x 8 blocks to those inside above which an image was compressed; noise alone stays below 1.1,
 a JPEG of quality 95 has 1.2 to 1.3."""
-
-SATURATED_SHARE = 0.05
-"""Share of the calibration's image that is saturated in a channel from which it is said."""
 
 COPLANAR = 0.3
 """Smallest singular value of the lights' directions below which they nearly lie in one plane."""

@@ -241,6 +241,12 @@ class Calibration:
         size = f"{sensor.height} x {sensor.width}, {sensor.mm_per_pixel:g} mm per pixel"
         return f"Calibration({sensor.name!r}, {size}, from {origin}: {model})"
 
+    def __str__(self) -> str:
+        """What a person reads of it: the model, how good it is likely to be, and why not to trust it."""
+        from .summary import summary_of
+
+        return summary_of(self)
+
     def __getstate__(self) -> dict[str, Any]:
         """The fields without the cached arrays, so that pickles and copies stay small."""
         return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}

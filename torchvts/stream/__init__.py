@@ -3,7 +3,6 @@
 from . import messages
 from .background import (
     FIRST_FRAMES,
-    NOT_METRIC,
     calibrate_background,
     find_background,
     read_background,
@@ -28,7 +27,6 @@ from .view import LiveView, has_screen, require_rerun
 
 __all__ = [
     "FIRST_FRAMES",
-    "NOT_METRIC",
     "Camera",
     "CameraSettings",
     "FrameCheck",

@@ -24,6 +24,7 @@ from ..core.checks import check_batch, check_image, check_integer, check_path, c
 from ..core.recordings import is_film, video_codec
 from ..model import Calibration, Sensor, SensorPrior, check_calibration, check_sensor
 from ..model.calibration import PEDESTAL
+from ..model.summary import NOT_METRIC
 from ..normals import NormalFromResponse
 from .sources import frames
 
@@ -35,10 +36,6 @@ BLOCKS = 4.0 / 255.0
 
 ROUGH_DEG = 3.3
 """Slopes for which a prior takes the structure of an image; more is a contact."""
-
-NOT_METRIC = "depth is NOT METRIC"
-"""What a stream says of a calibration whose scale is not known."""
-
 
 WITHOUT_FIRST = (
     "start without contact, or use the background of a calibration (--calibration with --background-frames 0; background_frames=0)"

@@ -1,21 +1,21 @@
-"""What a person reads of a calibration: the model, how good it is likely to be, what was left out; candidates on request."""
+"""What a person reads of a calibration: the model, how good it is likely to be, doubts, what was left out, what was tried."""
 
-import sys
-import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 
-from torch import Tensor
-
-from ..calibration import CalibrationWarning, Press, calibrate
 from ..core.tables import markdown, number
-from ..diagnose.checks import SATURATED_SHARE
-from ..model import Calibration, PointLights, Sensor
-from ..model.report import NOT_CHECKED, PressRow, Report
-from ..model.stated_error import UNKNOWN_DEG, press_next
-from ..stream import NOT_METRIC
+from .calibration import Calibration
+from .lights import PointLights
+from .report import NOT_CHECKED, PressRow, Report
+from .stated_error import UNKNOWN_DEG, press_next
 
 SHOWN = 5
-"""Of a list, so many lines are printed."""
+"""Of a list, so many lines are shown."""
+
+NOT_METRIC = "depth is NOT METRIC"
+"""What is said of a calibration whose scale is in doubt."""
+
+SATURATED_SHARE = 0.05
+"""Share of the calibration's image that is saturated in a channel from which it is said."""
 
 BY = {
     "given": "given",
@@ -28,56 +28,46 @@ BY = {
 """Where a model comes from, in words, for reports without a reason."""
 
 
-def print_calibration(calibration: Calibration, candidates: bool = False) -> None:
-    """Print a few lines about a calibration.
+def summary_of(calibration: Calibration, tried: bool = False) -> str:
+    """A few lines about a calibration, those of ``print(calibration)``.
 
     Args:
         calibration: of the unit.
-        candidates: print all models that were made, the lights and all presses, too.
+        tried: with all models that were made, the lights and all presses.
     """
     report, sensor = calibration.report, calibration.sensor
-    size = f"{sensor.height} x {sensor.width} px, {sensor.mm_per_pixel:g} mm per pixel, gamma {sensor.exponent:g}"
-    print(f"sensor: {sensor.name}, {size}")
     kind = "point lights" if report["model"] == "point_lights" else "response field"
     reason = report.get("reason", BY[report["source"]])
-    print(f"chosen: {reason}" if reason.startswith(f"{kind}:") else f"chosen: {kind}: {reason}")
-    print(f"expected: {expected(calibration)}")
+    size = f"{sensor.height} x {sensor.width} px, {sensor.mm_per_pixel:g} mm per pixel, gamma {sensor.exponent:g}"
+    lines = [
+        f"sensor: {sensor.name}, {size}",
+        f"chosen: {reason}" if reason.startswith(f"{kind}:") else f"chosen: {kind}: {reason}",
+        f"expected: {expected(calibration)}",
+    ]
     if (least_known := press_next(calibration)) is not None:
         place, error_deg = least_known
         x, y = ((n - 0.5 * (size - 1)) * sensor.mm_per_pixel for n, size in zip(place, (sensor.width, sensor.height), strict=True))
         where = f"x {place[0]}, y {place[1]} px of rectified images ({x:+.1f}, {y:+.1f} mm from the middle)"
-        print(f"press next: around {where}: there normals are expected to about {error_deg:.1f} degrees")
+        lines.append(f"press next: around {where}: there normals are expected to about {error_deg:.1f} degrees")
     saturated = float((calibration.background >= calibration.saturation_light).any(0).double().mean())
     if saturated > SATURATED_SHARE:
-        print(f"saturated: {saturated:.0%} of the background: depth is worse there; reduce the exposure and calibrate again")
-    print_doubts(report)
-    for line in left_out("press", [(row["name"], row.get("reason", "")) for row in report.get("presses", []) if not row["used"]]):
-        print(line)
-    if candidates:
-        print_tried(report)
+        lines.append(f"saturated: {saturated:.0%} of the background: depth is worse there; reduce the exposure and calibrate again")
+    lines += doubts_of(report)
+    lines += left_out("press", [(row["name"], row.get("reason", "")) for row in report.get("presses", []) if not row["used"]])
+    if tried:
+        lines += ["", *_tried(report)]
         if calibration.lights is not None:
-            print_lights(calibration.lights, report)
+            lines += ["", _lights(calibration.lights, report)]
         if "presses" in report:
-            print_presses(report["presses"])
+            lines += ["", *_presses(report["presses"])]
+    return "\n".join(lines)
 
 
-def print_doubts(report: Report) -> None:
-    """Print why not to trust a calibration, a line each; presses that were left out are named elsewhere."""
+def doubts_of(report: Report) -> list[str]:
+    """Why not to trust a calibration, a line each; presses that were left out are named elsewhere."""
     presses = tuple(f"{row['name']}: left out" for row in report.get("presses", []) if not row["used"])
-    for doubt in report.get("doubts", []):
-        if not doubt.startswith(presses):
-            print(doubt if doubt.startswith(NOT_CHECKED) else f"doubt: {doubt}")
-
-
-def calibrated(background: Tensor, sensor: Sensor, presses: Sequence[Press], force: bool = False) -> Calibration:
-    """:func:`torchvts.calibrate`; warnings become lines on stderr, save the doubts, which the summary prints."""
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", CalibrationWarning)
-        calibration = calibrate(background, sensor, presses, progress=True, force=force)
-    for text in dict.fromkeys(str(warning.message) for warning in caught):
-        if text not in calibration.report.get("doubts", []):
-            print(f"torchvts: warning: {text}", file=sys.stderr)
-    return calibration
+    doubts = [doubt for doubt in report.get("doubts", []) if not doubt.startswith(presses)]
+    return [doubt if doubt.startswith(NOT_CHECKED) else f"doubt: {doubt}" for doubt in doubts]
 
 
 def expected(calibration: Calibration) -> str:
@@ -111,29 +101,30 @@ def left_out(what: str, rows: list[tuple[str, str]]) -> Iterator[str]:
         yield f"left out: {len(rows) - SHOWN} more"
 
 
-def print_tried(report: Report) -> None:
-    """Print a row for each model that was made."""
+def _tried(report: Report) -> list[str]:
+    """A row for each model that was made."""
     rows = [[row["name"], number(row["error_deg"], 2), "; ".join(row["doubts"])] for row in report.get("tried", [])]
-    print("\n" + markdown(("model", "deg", "doubts"), rows))
-    print("deg: mean angle on each press by the others, or of a prior on other units; of lights the least certain direction")
+    meaning = "deg: mean angle on each press by the others, or of a prior on other units; of lights the least certain direction"
+    return [markdown(("model", "deg", "doubts"), rows), meaning]
 
 
-def print_lights(lights: PointLights, report: Report) -> None:
-    """Print where the lights are."""
+def _lights(lights: PointLights, report: Report) -> str:
+    """Where the lights are."""
     spread = [f"{v:.2f}" for v in report["direction_std_deg"]] if "direction_std_deg" in report else ["given"] * 3
     places = [[f"{v:.2f}" for v in place] for place in lights.position_mm.tolist()]
     gloss = [f"{v:.3f}" for v in lights.gloss.tolist()]
     titles = ("light", "x mm", "y mm", "z mm", "direction +- deg", "gloss")
-    print("\n" + markdown(titles, [[name, *places[j], spread[j], gloss[j]] for j, name in enumerate("RGB")]))
+    return markdown(titles, [[name, *places[j], spread[j], gloss[j]] for j, name in enumerate("RGB")])
 
 
-def print_presses(presses: list[PressRow]) -> None:
-    """Print a row for each press."""
-    lines = []
+def _presses(presses: list[PressRow]) -> list[str]:
+    """A row for each press."""
+    rows = []
     for press in presses:
         center = ", ".join(f"{v:.1f}" for v in press["center_px"]) if "center_px" in press else ""
         wide = 1.0 / max(press["gain"], 1e-3) if "gain" in press else None
         figures = [number(press.get("contact_radius_px"), 1), number(press.get("error_deg"), 1), number(wide, 2)]
-        lines.append([press["name"], center, *figures, "" if press["used"] else f"left out: {press.get('reason', '')}"])
-    print("\n" + markdown(("press", "center px", "contact radius px", "error deg", "times as wide as given", ""), lines))
-    print("error, times as wide: slopes by the field of the other presses, or by the prior, compared with the ball's")
+        rows.append([press["name"], center, *figures, "" if press["used"] else f"left out: {press.get('reason', '')}"])
+    titles = ("press", "center px", "contact radius px", "error deg", "times as wide as given", "")
+    meaning = "error, times as wide: slopes by the field of the other presses, or by the prior, compared with the ball's"
+    return [markdown(titles, rows), meaning]

@@ -82,7 +82,7 @@ def test_a_press_turned_moved_tilted_and_deeper_is_found(letters, reference, ang
     deg, mm = off(forth.T_target_source, truth)
     assert deg < 0.1 and mm < 0.02
     deg, mm = off(forth.T_target_source @ back.T_target_source, torch.eye(4, dtype=torch.float64))
-    assert deg < 0.05 and mm < 0.01
+    assert deg < 0.05 and mm < 0.02
     assert torch.allclose(forth.inverse() @ forth.T_target_source, torch.eye(4, dtype=torch.float64), atol=1e-12)
 
 
@@ -293,19 +293,19 @@ def test_contact_clouds_of_two_presses(open3d, with_normals, most):
     assert deg < (0.05 if most is None else 0.3) and mm < (0.01 if most is None else 0.05)
 
 
-def test_clouds_of_spheres_are_ambiguous():
+def test_clouds_of_spheres_are_ambiguous(open3d):
     one, two = (frame(objects.sphere(), objects.pose(press_mm=d)) for d in (0.5, 0.6))
     found = vts.register_points(contact_cloud(one, PITCH, None)[0], contact_cloud(two, PITCH, None)[0])
     assert found.ambiguous == ["rotation about x", "rotation about y", "rotation about z"]
 
 
-def test_clouds_that_do_not_match_do_not_converge(reference):
+def test_clouds_that_do_not_match_do_not_converge(open3d, reference):
     other = frame(objects.TARGETS["gear"].height_mm, objects.pose(20.0, (0.5, 0.0), 0.5))
     found = vts.register_points(contact_cloud(other, PITCH, None)[0], contact_cloud(reference, PITCH, None)[0])
     assert not found.converged and found.message
 
 
-def test_duplicate_points_change_nothing(reference):
+def test_duplicate_points_change_nothing(open3d, reference):
     cloud = contact_cloud(reference, PITCH, None)[0]
     moved = cloud + torch.tensor([0.5, 0.2, 0.0], dtype=torch.float64)
     found = vts.register_points(torch.cat((cloud, cloud[:100])), moved)
@@ -313,17 +313,14 @@ def test_duplicate_points_change_nothing(reference):
     assert torch.equal(found.T_target_source, vts.register_points(cloud, moved).T_target_source)
 
 
-def test_without_open3d_contacts_register_and_are_written(monkeypatch, reference, tmp_path):
+def test_without_open3d_clouds_are_written_and_its_lack_is_said(monkeypatch, reference, tmp_path):
     monkeypatch.setitem(sys.modules, "open3d", None)
-    cloud = contact_cloud(reference, PITCH, None)[0]
-    assert vts.register_points(cloud, cloud + torch.tensor([0.1, 0.1, 0.0])).converged
-    other = frame(objects.key(), objects.pose(20.0))
-    assert not vts.register_points(cloud, contact_cloud(other, PITCH, None)[0]).converged
+    cloud = contact_cloud(reference, PITCH)[0]
     for suffix in clouds.CLOUD_SUFFIXES:
         clouds.write_point_cloud(tmp_path / f"a{suffix}", cloud)
         assert (tmp_path / f"a{suffix}").stat().st_size > 12 * len(cloud)
     with pytest.raises(ImportError, match=r"pip install 'torchvts\[pose\]'"):
-        vts.register_points(cloud, contact_cloud(reference, PITCH)[0])
+        vts.register_points(cloud, cloud)
 
 
 def test_clouds_in_metres_are_read_as_such_or_named(open3d, run_script, tmp_path):

@@ -50,7 +50,7 @@ def height_sums(
 def track_grids(
     depth: Tensor, slopes: Tensor, contact: Tensor, least_mm: float, times: tuple[int, int]
 ) -> tuple[Tensor, Tensor, int]:
-    """Fine and coarse channels (H, W, 4) of a frame, and how many fine pixels lie on it: see :mod:`torchvts.pose.keyframe`.
+    """Fine and coarse channels (H, W, 4) of a frame, and how many fine pixels lie on it: see :mod:`torchvts.pose.grids`.
 
     Args:
         depth: (1, 1, H, W), contiguous as the others.

@@ -1,4 +1,4 @@
-"""Pose of pressed objects, and point clouds of contacts. Reading clouds, and all but those of all pixels, needs Open3D."""
+"""Pose of pressed objects, and point clouds of contacts. Reading and registering clouds needs Open3D."""
 
 from .clouds import contact_cloud, read_point_cloud, write_point_cloud
 from .direct import register_depth

@@ -14,12 +14,17 @@ from torch.nn.functional import avg_pool2d
 
 from ..core.checks import check_integer, check_path, check_positive, check_tensor
 from ..core.geometry import depth_to_points
+from ..core.morphology import dilate
 from . import read_cloud
+from .grids import DepthFrame, least_depth_mm, slope_noise, surface_of
 from .output_frame import SENSOR_AXES
-from .relief import DepthFrame, contact_of, sure_contact
 from .surface_files import write_pcd, write_ply
 
 CLOUD_SUFFIXES = (".pcd", ".ply")
+
+SPREAD = (0.7548776662466927, 0.5698402909980532)
+"""Multiples of the row and the column of a pixel, modulo 1, by which a part of the pixels is spread evenly over the image (Roberts,
+The unreasonable effectiveness of quasirandom sequences, 2018)."""
 
 HEAD_BYTES, MOST_BYTES = 2**16, 2**31
 """Largest header of a file, and largest file, that is read."""
@@ -35,16 +40,17 @@ def contact_cloud(frame: DepthFrame, mm_per_pixel: float, most: int | None = 100
     Args:
         frame: a :class:`torchvts.DepthOutput`.
         mm_per_pixel: pitch, mm.
-        most: largest number of points; a larger cloud is thinned evenly, one point of each cube of a grid, seldom to fewer than 0.9
-            of it. None keeps all.
+        most: largest number of points, evenly spread; None keeps all.
     Returns:
         Points (N, 3), mm, and unit normals (N, 3), float64.
     Raises:
         ValueError: not one frame, values not finite, or no contact deeper than the noise.
     """
     mm_per_pixel = check_positive("mm_per_pixel", mm_per_pixel)
-    depth, gradient, contact = contact_of(frame, "frame")
-    inside = sure_contact(depth, gradient, contact, mm_per_pixel)
+    surface = surface_of(frame, "frame", with_skin=True)
+    depth, gradient, contact = surface.depth_mm[0, 0], surface.gradient[0], surface.contact[0, 0]
+    whole = contact & (depth > least_depth_mm(slope_noise(surface), mm_per_pixel))
+    inside = ~dilate(~whole[None, None])[0, 0]  # without its rim
     if not bool(inside.any()):
         raise ValueError("frame: expected a contact deeper than its own noise, got none: pressed too faintly")
     points = depth_to_points(depth, mm_per_pixel, inside).double()
@@ -53,34 +59,11 @@ def contact_cloud(frame: DepthFrame, mm_per_pixel: float, most: int | None = 100
         gradient = avg_pool2d(gradient * contact, 3, 1, 1) / share.clamp_min(1e-6)
     normals = torch.stack((-gradient[0], gradient[1], torch.ones_like(depth)), dim=-1)[inside].double()
     normals = torch.nn.functional.normalize(normals, dim=1)
-    index = torch.arange(len(points)) if most is None else thin(points, check_integer("most", most, 1))
-    return points[index], normals[index]
-
-
-def thin(points: Tensor, most: int) -> Tensor:
-    """Indices of at most ``most`` points, evenly spread: one of each cell of a grid."""
-    if len(points) <= most:
-        return torch.arange(len(points))
-    low, high = 0.0, float((points.amax(0) - points.amin(0)).max())
-    kept = torch.arange(len(points))
-    for _ in range(24):
-        size = 0.5 * (low + high)
-        index = voxel_first(points, size)
-        if len(index) > most:
-            low = size
-        else:
-            high, kept = size, index
-            if len(index) > 0.9 * most:
-                break
-    return kept
-
-
-def voxel_first(points: Tensor, size: float) -> Tensor:
-    """Indices of the first point of each cube of side ``size``, ascending."""
-    cell = torch.floor((points - points.amin(0)) / size).long()
-    extent = cell.amax(0) + 1
-    code = (cell[:, 0] * extent[1] + cell[:, 1]) * extent[2] + cell[:, 2]
-    return torch.from_numpy(np.sort(np.unique(code.numpy(), return_index=True)[1]))
+    if most is not None and len(points) > check_integer("most", most, 1):
+        row, column = (place.double() for place in torch.nonzero(inside, as_tuple=True))
+        index = ((SPREAD[0] * row + SPREAD[1] * column) % 1.0).argsort(stable=True)[:most].sort().values
+        points, normals = points[index], normals[index]
+    return points, normals
 
 
 def write_point_cloud(path: str | Path, points: Tensor, normals: Tensor | None = None, text: str = SENSOR_AXES) -> None:

@@ -1,21 +1,39 @@
-"""Pose from two depth frames: search over the plane, refinement on every pixel of the common contact, then ambiguity."""
+"""Pose from two depth frames: search over the plane, the aligner, and all other poses that fit as well."""
 
-import dataclasses
+import itertools
 import math
+from collections import deque
+from collections.abc import Sequence
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from ..core.checks import check_least
 from ..core.geometry import check_rigid
-from .alignment import Fit, agrees_enough, distinct, equally_good, is_trusted, rank, refine, score_poses
-from .ambiguity import UNKNOWN_VARIANCE, Unknown, find_unknown, pose_covariance, turned_otherwise
-from .relief import DepthFrame, Levels, levels
-from .result import Registration, invert, turn_deg
+from .ambiguity import UNKNOWN_VARIANCE
+from .follow import Followed, follow
+from .grids import DepthFrame, Grids, checked_grids, resolution_of, surface_of
+from .inverse import MOST_COST, SLOPE_NOISE, Points, Score, bare_points, refine, score_pose
+from .keyframe import Keyframe, make_keyframe
+from .result import Registration
+from .rigid import Array, distance_mm, inverted, orthonormal, rotation_vector
 from .search import search_plane
 
 MOST_TURNS, MOST_AGAIN = 4, 16
 """Rotations with which shifts are searched again, and hypotheses that come of it, at most."""
+
+SAME_MM, MOST_TRIED = 0.4, 72
+"""Poses that move the contact to so nearly the same place are one, mm; and so many starts are tried for equal poses at most."""
+
+EQUAL, EQUAL_COST = 2.3, 0.008
+"""Poses are equal whose costs on the fine grid are within so many times the least one, or so much more. A bolt head turned by 10
+to 30 degrees, of which hardly more than the outline says so, has 3 times that or more; where slopes err by 3 degrees its equal
+poses have up to 2.2."""
+
+
+OTHERWISE_DEG = 20.0
+"""Two poses are different ones if known rotations between them are larger."""
 
 
 def register_depth(source: DepthFrame, target: DepthFrame, mm_per_pixel: float, *, initial: Tensor | None = None) -> Registration:
@@ -40,7 +58,7 @@ def register_depth(source: DepthFrame, target: DepthFrame, mm_per_pixel: float, 
         ValueError: not one frame, sizes that differ, values not finite, a contact of a few pixels, or ``initial`` is no rigid
             motion.
     Source:
-        Padfield 2012 for the search; direct alignment as in Lucas, Kanade 1981 with Cauchy's loss.
+        Padfield 2012 for the search; the aligner is that of :class:`torchvts.PoseTracker`.
     Example:
         >>> import math
         >>> from torchvts.scenes import objects
@@ -51,118 +69,176 @@ def register_depth(source: DepthFrame, target: DepthFrame, mm_per_pixel: float, 
         (True, 30.0)
     """
     mm_per_pixel = check_least("mm_per_pixel", mm_per_pixel, 1e-6, 1e3)  # a nanometre, a metre
-    a, b = levels(source, mm_per_pixel, "source"), levels(target, mm_per_pixel, "target")
-    sizes = [tuple(frame.depth_mm.shape[-2:]) for frame in (source, target)]
+    moving, fixed = (surface_of(frame, name, with_skin=True) for frame, name in ((source, "source"), (target, "target")))
+    keyframe = make_keyframe(moving, mm_per_pixel, "source")
+    frame = checked_grids(fixed, mm_per_pixel, resolution_of(fixed, mm_per_pixel, "target"), "target")
+    sizes = [tuple(surface.depth_mm.shape[-2:]) for surface in (moving, fixed)]
     if sizes[0] != sizes[1]:
         cause = "positions count from the image's middle, so a cropped frame lies elsewhere"
         raise ValueError(f"source: expected {sizes[1][0]} x {sizes[1][1]} like target, got {sizes[0][0]} x {sizes[0][1]}: {cause}")
-    found = align(a, b, None if initial is None else check_rigid("initial", initial))
-    others = [_refine_both_ways(a, b, pose[None])[0] for pose in found.alternatives]
-    return dataclasses.replace(found, alternatives=others)
+    starts = [] if initial is None else [check_rigid("initial", initial).numpy()]
+    if starts and (near := follow(keyframe, frame, starts)).agrees:
+        return _registration([near])
+    starts += likely_poses(keyframe, frame)
+    if not starts:
+        reason = "nothing fits: one of the contacts has no relief that could be compared"
+        unknown = torch.eye(6, dtype=torch.float64) * UNKNOWN_VARIANCE
+        return Registration(torch.eye(4, dtype=torch.float64), math.inf, 0.0, False, reason, unknown, [], [], 0.0)
+    return _registration(equal_poses(keyframe, frame, starts) or [follow(keyframe, frame, starts[:1])])
 
 
-def align(a: Levels, b: Levels, start: Tensor | None) -> Registration:
-    """Register two prepared frames, source ``a`` on target ``b``; tries ``start`` first. Alternatives are those of middle grids."""
-    if start is not None:
-        poses = refine(a.coarse, b.coarse, start[None], 6, 2.0)
-        if is_trusted(score_poses(a.coarse, b.coarse, poses), 0):
-            return _finish(a, b, poses)
-    poses, score = search_plane(a.coarse, b.coarse)
-    poses = poses[score > 0.4 * score[:1]]
-    if len(poses) == 0:
-        return _nothing("one of the contacts has no relief that could be compared")
-    if start is not None:
-        poses = torch.cat((start[None], poses))
-    poses = _likely(a, b, refine(a.coarse, b.coarse, poses, 4, 4.0))
-    again, _ = search_plane(a.coarse, b.coarse, MOST_AGAIN, _turns(poses))
-    return _finish(a, b, _likely(a, b, torch.cat((poses, refine(a.coarse, b.coarse, again, 4, 4.0)))))
+def _registration(found: list[Followed]) -> Registration:
+    """The best pose, with the others that are equal to it."""
+    best, poses = found[0], [torch.from_numpy(orthonormal(one.pose)) for one in found]
+    names, covariance = best.names if best.agrees else [], torch.from_numpy(best.covariance)
+    message = message_of(best.score, best.agrees)
+    if names:
+        message += f"; the surface slides on itself: {', '.join(names)} unknown"
+    if len(poses) > 1:
+        message += f"; {len(poses) - 1} more poses fit as well: the object is symmetric"
+    fitness, overlap, _ = best.score
+    return Registration(poses[0], best.fine.depth_noise, fitness, best.agrees, message, covariance, names, poses[1:], overlap)
 
 
-def _likely(a: Levels, b: Levels, poses: Tensor) -> Tensor:
-    """Those of the poses that cost little more than the best one, best first."""
-    fit = score_poses(a.coarse, b.coarse, poses)
-    order = distinct(fit, a.coarse, 0.5)
-    value = rank(fit)
-    return poses[[k for k in order if value[k] < 2.0 * value[order[0]] + 0.1]]
+def message_of(score: Score, agrees: bool) -> str:
+    """A score in words."""
+    common = f"{100 * score.fitness:.0f} % of the common contact agrees, which is {100 * score.overlap:.0f} % of the smaller one"
+    if agrees:
+        return common
+    if score.is_enough(math.inf):
+        return f"nothing fits well: {common}, but all of it differs: different objects, or slopes that err by degrees"
+    return f"nothing fits: {common}: different objects, or parts of one that hardly overlap"
 
 
-def _turns(poses: Tensor) -> Tensor:
+def likely_poses(keyframe: Keyframe, frame: Grids) -> list[Array]:
+    """Poses (4, 4), T_frame_keyframe, that fit equally well on the coarse grid, best first."""
+    own = bare_points(frame.coarse)
+    poses, score = search_plane(keyframe.grids.coarse, frame.coarse)
+    likely = _refined(keyframe, frame, own, list(poses[score > 0.4 * score[:1]].numpy()), 4)
+    if not likely:
+        return []
+    again, _ = search_plane(keyframe.grids.coarse, frame.coarse, MOST_AGAIN, _turns([pose for pose, _ in likely]))
+    likely = _refined(keyframe, frame, own, [*(pose for pose, _ in likely), *again.numpy()], 8)
+    least, most = likely[0][1].overlap, 1.5 * likely[0][1].cost + 0.01
+    return [likely[0][0], *(pose for pose, score in likely[1:] if score.cost < most and score.overlap > 0.7 * least)]
+
+
+def _refined(keyframe: Keyframe, frame: Grids, own: Points, poses: list[Array], steps: int) -> list[tuple[Array, Score]]:
+    """Those of the poses that, refined on the coarse grid, cost little more than the best one, without doubles, best first."""
+    refined = [refine(frame.coarse, keyframe.coarse, pose, steps, 4.0 * SLOPE_NOISE)[0] for pose in poses]
+    scored = [(pose, score_pose(frame.coarse, keyframe.coarse, keyframe.grids.coarse, own, pose)) for pose in refined]
+    scored.sort(key=lambda one: _rank(one[1]))
+    kept: list[tuple[Array, Score]] = []
+    for pose, score in scored:
+        if _rank(score) >= 2.0 * _rank(scored[0][1]) + 0.1:
+            break
+        if all(distance_mm(keyframe.spread, pose, other) > SAME_MM for other, _ in kept):
+            kept.append((pose, score))
+    return kept
+
+
+def _rank(score: Score) -> float:
+    """The cost with a surcharge for little overlap, which agrees by chance."""
+    return score.cost + 0.5 * max(0.5 - score.overlap, 0.0)
+
+
+def _turns(poses: list[Array]) -> Tensor:
     """Rotations in the plane, rad, of the best poses, those that differ.
 
     They are better known than the steps of the first search; with them the right shift stands out of others that are nearly right.
     """
-    angle = torch.atan2(poses[:, 1, 0], poses[:, 0, 0])
     kept: list[float] = []
-    for turn in angle.tolist():
+    for pose in poses:
+        turn = math.atan2(pose[1, 0], pose[0, 0])
         if all(abs(math.remainder(turn - other, 2.0 * math.pi)) > math.radians(1.0) for other in kept):
             kept.append(turn)
     return torch.tensor(kept[:MOST_TURNS], dtype=torch.float32)
 
 
-def symmetries(a: Levels) -> list[Tensor]:
+def symmetries(keyframe: Keyframe) -> list[Array]:
     """Motions (4, 4) after which a frame looks much the same: where slopes err, a symmetric object does not look quite the same."""
-    poses, score = search_plane(a.coarse, a.coarse)
-    poses = refine(a.coarse, a.coarse, refine(a.coarse, a.coarse, poses[score > 0.4 * score[0]], 4, 4.0), 5)
-    poses = torch.cat((torch.eye(4, dtype=torch.float64)[None], poses))
-    fit = score_poses(a.coarse, a.coarse, poses)
-    return [poses[k] for k in distinct(fit, a.coarse, 0.4)[1:] if is_trusted(fit, k)]
+    poses, score = search_plane(keyframe.grids.coarse, keyframe.grids.coarse)
+    starts = list(poses[score > 0.4 * score[:1]].numpy())
+    found = _refined(keyframe, keyframe.grids, bare_points(keyframe.grids.coarse), [np.eye(4), *starts], 9)
+    return [pose for pose, score in found if score.is_enough() and distance_mm(keyframe.spread, pose, np.eye(4)) > SAME_MM]
 
 
-def _finish(a: Levels, b: Levels, poses: Tensor) -> Registration:
-    """Refine the hypotheses level by level, keep those that fit equally well, and describe the best one."""
-    poses = refine(a.coarse, b.coarse, poses, 5, 1.0)
-    fit = score_poses(a.coarse, b.coarse, poses)
-    kept = equally_good(fit, distinct(fit, a.coarse, 0.4))
-    poses = refine(a.middle, b.middle, poses[kept], 3, 1.0)
-    fit = score_poses(a.middle, b.middle, poses)
-    kept = equally_good(fit, distinct(fit, a.middle, 0.4))
-    best = _refine_both_ways(a, b, poses[kept[:1]])
-    others = poses[kept[1:]]
-    fit = score_poses(a.middle, b.middle, best)
-    converged = is_trusted(fit, 0)
-    unknown = Unknown(torch.zeros(6, 0, dtype=torch.float64), [])
-    if converged:
-        unknown = find_unknown(a.coarse, b.coarse, best, b.noise)
-    rmse_mm, covariance = pose_covariance(a.fine, b.fine, best)
-    if unknown.names:
-        covariance = covariance + unknown.motions @ unknown.motions.T * UNKNOWN_VARIANCE
-    alternatives = list(others) if converged else []
-    if unknown.names:  # what differs by that alone is no other pose
-        turns = [(T @ invert(best[0]))[:3, :3].numpy() for T in alternatives]
-        alternatives = [alternatives[k] for k in turned_otherwise(turns, unknown.motions[:3].numpy(), unknown.names)]
-    message = _message(fit, unknown.names, len(alternatives))
-    fitness, overlap = float(fit.fitness[0]), float(fit.overlap[0])
-    return Registration(best[0], rmse_mm, fitness, converged, message, covariance, unknown.names, alternatives, overlap)
+def equal_poses(
+    keyframe: Keyframe, frame: Grids, starts: list[Array], motions: Sequence[Array] = (), most_cost: float = MOST_COST
+) -> list[Followed]:
+    """All poses that fit equally well, from some starts on, best first; none if nothing fits.
+
+    The motions between them are symmetries of the object, and so are the products of these, which are tried too: where slopes
+    err, a search finds a few of the twelve poses of a gear, or one. Which of them fits best is then chance.
+
+    Args:
+        keyframe: the reference.
+        frame: the new frame.
+        starts: poses (4, 4), T_frame_keyframe.
+        motions: (4, 4), symmetries of the keyframe, if they are known. Of a symmetric object that is tilted otherwise than the
+            reference other pixels touch: the fine grid counts them, so a pose beside such a motion is compared on the coarse one.
+        most_cost: of a pose that is taken.
+    """
+    found: list[Followed] = []
+    tried: list[Array] = []
+    waiting = deque(starts)
+
+    def is_new(pose: Array, others: list[Array]) -> bool:
+        return all(distance_mm(keyframe.spread, pose, other) >= SAME_MM for other in others)
+
+    def fits(one: Followed) -> bool:
+        return one.free.shape[1] < 6 and one.score.is_enough(most_cost)
+
+    while waiting and len(tried) < MOST_TRIED:
+        start = waiting.popleft()
+        if not is_new(start, tried):
+            continue
+        tried.append(start)
+        one = follow(keyframe, frame, [start])
+        known = [other.pose for other in found]
+        if not fits(one) or not is_new(one.pose, known):
+            continue
+        found.append(one)
+        if one.names:  # products of symmetries would differ by what is unknown: only what turns it otherwise is another pose
+            poses = [*(one.pose @ motion for motion in motions), *waiting]
+            others = [follow(keyframe, frame, [poses[k]]) for k in turned_otherwise(poses, one)]
+            others = [other for other in others if fits(other)]
+            found += [others[k] for k in turned_otherwise([other.pose for other in others], one)]
+            break
+        if not known:
+            waiting.extend(one.pose @ motion for motion in motions)
+        first = (known or [one.pose])[0]
+        waiting.extend(
+            a @ inverted(first) @ b for a, b in itertools.product([*known, one.pose], repeat=2) if a is one.pose or b is one.pose
+        )
+    if not found:
+        return []
+    found.sort(key=lambda one: one.fine.cost)
+    best = found[0]
+
+    def is_equal(one: Followed) -> bool:
+        motion = inverted(best.pose) @ one.pose
+        return _equals(one.fine.cost, best.fine.cost) or (
+            _equals(one.score.cost, best.score.cost) and not is_new(motion, list(motions))
+        )
+
+    return [one for one in found if is_equal(one)]
 
 
-def _nothing(reason: str) -> Registration:
-    """No pose, of no certainty."""
-    unknown = torch.eye(6, dtype=torch.float64) * UNKNOWN_VARIANCE
-    return Registration(torch.eye(4, dtype=torch.float64), math.inf, 0.0, False, f"nothing fits: {reason}", unknown, [], [], 0.0)
+def turned_otherwise(poses: list[Array], one: Followed) -> list[int]:
+    """Which of some poses are others than ``one``, and than those before, though some rotations are unknown.
+
+    A capsule may have rolled, which is unknown, and may also point the other way.
+    """
+    rotations = sum(name.startswith("rotation") for name in one.names)  # a large ball that rolls mostly shifts: sizes say little
+    axes = np.linalg.svd(one.free[:3], full_matrices=False)[0][:, :rotations]
+    kept: list[int] = []
+    for k, pose in enumerate(poses):
+        between = [rotation_vector(other[:3, :3].T @ pose[:3, :3]) for other in (one.pose, *(poses[j] for j in kept))]
+        if min(np.linalg.norm(turn - axes @ (axes.T @ turn)) for turn in between) > math.radians(OTHERWISE_DEG):
+            kept.append(k)
+    return kept
 
 
-def _refine_both_ways(a: Levels, b: Levels, pose: Tensor) -> Tensor:
-    """The mean of the fine poses from source to target and back, so that neither frame is preferred."""
-    forth = refine(a.fine, b.fine, pose, 12, 0.5)
-    back = invert(refine(b.fine, a.fine, invert(pose), 12, 0.5))
-    center = a.fine.points.double().mean(0)
-    places = [T[0, :3, :3] @ center + T[0, :3, 3] for T in (forth, back)]
-    if float((places[0] - places[1]).norm()) > 0.1 or float(turn_deg(forth @ invert(back))) > 1.0:
-        return forth
-    u, _, vh = torch.linalg.svd(forth[0, :3, :3] + back[0, :3, :3])
-    mean = forth.clone()
-    mean[0, :3, :3] = u @ vh
-    mean[0, :3, 3] = 0.5 * (places[0] + places[1]) - u @ vh @ center
-    return mean
-
-
-def _message(fit: Fit, names: list[str], others: int) -> str:
-    fitness, overlap = float(fit.fitness[0]), float(fit.overlap[0])
-    agreement = f"{100 * fitness:.0f} % of the common contact agrees, which is {100 * overlap:.0f} % of the smaller one"
-    if not is_trusted(fit, 0) and agrees_enough(fitness, overlap, 0.0):
-        return f"nothing fits well: {agreement}, but all of it differs: different objects, or slopes that err by degrees"
-    if not is_trusted(fit, 0):
-        return f"nothing fits: {agreement}: different objects, or parts of one that hardly overlap"
-    if names:
-        agreement += f"; the surface slides on itself: {', '.join(names)} unknown"
-    return agreement + (f"; {others} more poses fit as well: the object is symmetric" if others else "")
+def _equals(cost: float, least: float) -> bool:
+    return cost < max(EQUAL * least, least + EQUAL_COST)

@@ -6,7 +6,7 @@ that. The covariance of heights says how hardly.
 """
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -14,8 +14,8 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from ..compiled import library, tracking
-from .alignment import SLOPE_NOISE
-from .inverse import HEIGHT_NOISE_MM, SHALLOW_MM, Field, Pixels, residual_limits
+from .grids import Grid, Image, Mask
+from .inverse import HEIGHT_NOISE_MM, SHALLOW_MM, SLOPE_NOISE, Points, Sums, residual_limits, residuals
 from .rigid import Array
 
 ALIKE_MM, ALIKE_SLOPE = 2.5, 0.4
@@ -35,8 +35,6 @@ MOST_MM = 2.0 * HEIGHT_NOISE_MM
 MODES = 64
 """Modes of the error of heights that are kept: they leave out 1 to 6 % of the variance."""
 
-Mask = npt.NDArray[np.bool_]
-Image = npt.NDArray[Any]
 Index = npt.NDArray[np.int64]
 
 
@@ -57,7 +55,7 @@ class HeightErrors(NamedTuple):
     products: Array
 
 
-def height_errors(gradient: Tensor, skin: Tensor, mm_per_pixel: float, times: int, pixels: Pixels) -> HeightErrors:
+def height_errors(gradient: Tensor, skin: Tensor, mm_per_pixel: float, times: int, points: Points) -> HeightErrors:
     """Cells of a keyframe and the modes of their errors.
 
     Args:
@@ -65,19 +63,19 @@ def height_errors(gradient: Tensor, skin: Tensor, mm_per_pixel: float, times: in
         skin: (1, 1, H, W) bool, deformed skin: around it heights are zero.
         mm_per_pixel: pitch, mm.
         times: pixels a side of a cell.
-        pixels: of the keyframe.
+        points: of the keyframe.
     """
     height, width = skin.shape[-2:]
     share = avg_pool2d(skin.double(), times)
     slope = (avg_pool2d(gradient.double() * skin, times) / share.clamp_min(0.2))[0].numpy()
-    x, y = pixels.columns[:2].double().numpy()
+    x, y = points.columns[:2].double().numpy()
     column = ((x / mm_per_pixel + 0.5 * width) / times).astype(int).clip(0, slope.shape[2] - 1)
     row = ((0.5 * height - y / mm_per_pixel) / times).astype(int).clip(0, slope.shape[1] - 1)
     deformed = share[0, 0].numpy() > 0.5
     deformed[row, column] = True
     cells, cell = np.unique(row * slope.shape[2] + column, return_inverse=True)
     number = np.bincount(cell).astype(np.float64)
-    by = np.stack([np.bincount(cell, one) for one in pixels.columns[17:].double().numpy()], 1) / number[:, None]
+    by = np.stack([np.bincount(cell, one) for one in points.columns[17:].double().numpy()], 1) / number[:, None]
     chosen = (np.cumsum(deformed) - 1)[cells]
     covariance = 2.0 * _covariance(slope, deformed, times * mm_per_pixel, chosen)  # the keyframe's and the frame's
     lines = np.ascontiguousarray(np.hstack((_modes(covariance, MODES), by)) / WHITE_MM)
@@ -143,24 +141,26 @@ def _modes(covariance: Array, most: int) -> Array:
     return modes.T
 
 
-def height_sums(errors: HeightErrors, field: Field, pixels: Pixels, pose: Array) -> tuple[Array, Array]:
+def height_sums(errors: HeightErrors, grid: Grid, points: Points, pose: Array) -> tuple[Array, Array]:
     """J^T C^-1 J (6, 6) and J^T C^-1 r (6,) of the heights of cells that both contacts hold: generalised least squares.
 
     C is that of the modes and of white noise; so the sizes of the modes are fitted beside the twist.
 
     Args:
         errors: of the keyframe.
-        field: the new frame.
-        pixels: the keyframe's, those that ``errors`` was made of.
-        pose: (4, 4), of the keyframe in the field's frame.
+        grid: the new frame.
+        points: the keyframe's, those that ``errors`` was made of.
+        pose: (4, 4), of the keyframe in the grid's frame.
     Source:
         Aitken, Proceedings of the Royal Society of Edinburgh 55, 1935.
     """
+    limits = residual_limits(grid, pose, SLOPE_NOISE)
     if library() is not None:
-        limits = residual_limits(field, pose, SLOPE_NOISE)
-        left = tracking.height_sums(field.channels, pixels.columns, limits, errors, MOST_MM, WHITE_MM)
+        left = tracking.height_sums(grid.channels, points.columns, limits, errors, MOST_MM, WHITE_MM)
         return left[:6, :6], left[:6, 6]
-    residual, seen = _height_residuals(field, pixels, pose)
+    found = residuals(grid.channels, points.columns, limits)
+    residual = found.values[2]
+    seen = found.inside & (found.height > SHALLOW_MM) & (np.abs(residual) < MOST_MM)
     cell = errors.cell[seen]
     count = np.bincount(cell, minlength=len(errors.number))
     used = count >= 0.5 * errors.number
@@ -173,18 +173,13 @@ def height_sums(errors: HeightErrors, field: Field, pixels: Pixels, pose: Array)
     return left[:6, :6], left[:6, 6]
 
 
-def _height_residuals(field: Field, pixels: Pixels, pose: Array) -> tuple[Array, Mask]:
-    """Heights of a frame minus those of the keyframe's pixels under a pose, (N,) mm, and which of them can be compared."""
-    x, y, expected = pose[:3, :3].astype(np.float32) @ pixels.columns[:3].numpy() + pose[:3, 3:].astype(np.float32)
-    column, row = (x - field.x0) / field.pitch, (field.y0 - y) / field.pitch
-    height, width = field.channels.shape[:2]
-    seen = (column >= 0) & (column <= width - 1) & (row >= 0) & (row <= height - 1) & (expected > SHALLOW_MM)
-    left, top = column.astype(np.int32).clip(0, width - 2), row.astype(np.int32).clip(0, height - 2)
-    along, down = (column - left)[:, None], (row - top)[:, None]
-    flat, first = field.channels.numpy().reshape(-1, 4), top * width + left
-    upper, lower = flat.take(first, 0), flat.take(first + width, 0)
-    upper += along * (flat.take(first + 1, 0) - upper)
-    lower += along * (flat.take(first + width + 1, 0) - lower)
-    upper += down * (lower - upper)
-    residual = upper[:, 0] - expected
-    return residual, seen & (upper[:, 3] > 0.999) & (np.abs(residual) < MOST_MM)
+def covariance_with_heights(slopes: Sums, both: Sums, by_slopes: Array) -> Array:
+    """Covariance of the scaled twist that slopes and heights ask for, from that of the slopes alone.
+
+    Heights err as the modes have it, by as much less or more as the slopes of the two frames differ less or more.
+    """
+    spread = np.linalg.inv(both.matrix + 1e-9 * float(np.trace(both.matrix)) * np.eye(6))
+    share = spread @ slopes.matrix
+    size = 0.5 * (slopes.slope_noise / ERROR) ** 2
+    scaled: Array = share @ by_slopes @ share.T + size * spread @ (both.matrix - slopes.matrix) @ spread
+    return scaled

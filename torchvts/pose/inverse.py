@@ -1,7 +1,7 @@
 """Inverse compositional alignment: a pose is moved so that a new frame, seen from the reference, agrees with the reference.
 
 The pulled-back slopes of the new frame minus those of the reference have, near the right pose, the derivatives of the reference
-with respect to its own motion. So they are computed once per reference. Slopes count more than heights, as in :mod:`.alignment`.
+with respect to its own motion. So they are computed once per reference. Slopes count more than heights.
 """
 
 import math
@@ -13,9 +13,20 @@ import torch
 from torch import Tensor
 
 from ..compiled import library, tracking
-from .alignment import CUT, DEPTH_DRIFT_MM, SLOPE_NOISE, linearise
-from .relief import Relief
-from .rigid import Array, inverted, rigid_motion, rotation_vector
+from .grids import Grid, Image, Mask
+from .rigid import Array, adjoint, cross, inverted, rigid_motion, rotation_vector
+
+SLOPE_NOISE = 0.06
+"""Disagreement of slopes that counts as noise, mm per mm: calibrated sensors err by 2 to 3 degrees, exact ones by less."""
+
+DEPTH_DRIFT_MM = 0.5
+"""The same of heights when poses are refined: errors of integrated depth are alike over the whole contact and would tilt it."""
+
+HEIGHT_NOISE_MM = 0.1
+"""The same of heights in a score: what integrated slopes that err by 3 degrees add up to."""
+
+CUT = 4.0
+"""A pixel whose residual exceeds this multiple of the noise is an outlier."""
 
 DEEP_MM, SHALLOW_MM = 0.06, 0.02
 """Reference pixels that should be deeper than this under a pose count in its score; in its refinement from the second on."""
@@ -23,34 +34,24 @@ DEEP_MM, SHALLOW_MM = 0.06, 0.02
 LEAST_NOISE, LARGEST_STEP_MM = 0.02, 0.6
 """Slope noise down to which the weights narrow, and the largest step, mm at the contact."""
 
-HEIGHT_NOISE_MM = 0.1
-"""Disagreement of heights that counts as noise in a score: what integrated slopes that err by 3 degrees add up to."""
+LEAST_FITNESS, LEAST_OVERLAP, MOST_COST = 0.85, 0.3, 0.25
+"""Thresholds that a score must reach to be trusted."""
+
+SMALL_FITNESS, SMALL_OVERLAP = 0.955, 0.2
+"""The same where the overlap is below LEAST_OVERLAP. No pair of different objects converges with them."""
+
+COARSE_WINDOW, FINE_WINDOW = np.ones(3), np.array([1.0, 4.0, 6.0, 4.0, 1.0])
+"""Weights of neighbours along each side in second derivatives, whose noise looks like information on the pose."""
 
 SCORE = (1.0 / (CUT * SLOPE_NOISE) ** 2, 1.0 / (CUT * HEIGHT_NOISE_MM) ** 2)
 
 
-class Field(NamedTuple):
-    """A frame on one grid, y up.
-
-    Attributes:
-        channels: (H, W, 4), z (mm), slopes p and q, and a mask: 1 where the skin surely lies on the object, 0 where it surely does
-            not, between them where it may.
-        x0: position of the upper left pixel, mm.
-        y0: the same, y up.
-        pitch: distance of pixels, mm.
-    """
-
-    channels: Tensor
-    x0: float
-    y0: float
-    pitch: float
-
-
-class Pixels(NamedTuple):
+class Points(NamedTuple):
     """Pixels of a reference and their derivatives by a scaled twist about ``center``.
 
     Attributes:
-        columns: (23, N), one column a pixel: x, y, z, p, q, and what p, q and z change by each of the six twists.
+        columns: (23, N), one column a pixel: x, y, z, p, q, and what p, q and z change by each of the six twists; (5, N) where no
+            derivatives are needed.
         center: (3,), mm.
         units: (6,), rad and mm: the twist that is one of each, so that all six are lengths at the contact.
     """
@@ -91,22 +92,81 @@ class Sums(NamedTuple):
     noise: float
 
 
-def reference_pixels(part: Relief, relief: Relief, center: Tensor, units: Tensor) -> Pixels:
-    """Pixels of a part of a relief, with the derivatives that the relief's field has there."""
-    lin = linearise(part, relief, torch.eye(4, dtype=torch.float64)[None], center[None, None])
-    by = torch.cat((lin.slope_by_twist[0], lin.height_by_twist[0][:, None]), 1) * units.float()  # (N, 3, 6)
-    columns = torch.cat((part.points, part.slopes, by.flatten(1)), 1).float().T.contiguous()
-    return Pixels(columns, center.numpy(), units.numpy())
+class Score(NamedTuple):
+    """Of a pose, from the pixels of both frames: one that should touch and does not counts as an outlier.
+
+    Attributes:
+        fitness: share of the pixels compared that agree.
+        overlap: share of the smaller contact that was compared.
+        cost: mean truncated residual, 0 to 1.
+    """
+
+    fitness: float
+    overlap: float
+    cost: float
+
+    def is_enough(self, most_cost: float = MOST_COST) -> bool:
+        """Whether the pose can be trusted: a small common part must agree nearly everywhere."""
+        least = LEAST_FITNESS if self.overlap >= LEAST_OVERLAP else SMALL_FITNESS
+        return self.fitness >= least and self.overlap >= SMALL_OVERLAP and self.cost <= most_cost
+
+
+def center_and_units(points: Image) -> tuple[Array, Array]:
+    """Centre (3,) of points (5, N), and units (6,): rotations that move their mean radius by 1 mm, and shifts of 1 mm."""
+    center = points[:3].mean(1, dtype=np.float64)
+    radius = math.sqrt(float(np.square(points[:2] - center[:2, None]).sum(0).mean()))
+    return center, np.array([1.0 / max(radius, 1e-6)] * 3 + [1.0] * 3)
+
+
+def points_of(grid: Grid, row: Array, column: Array, center: Array, units: Array, window: Array = COARSE_WINDOW) -> Points:
+    """Pixels of a grid and their derivatives by a motion of the grid's own surface."""
+    points = grid.points(row, column)
+    x, y, h = points[:3] - center[:, None]
+    p, q = points[3:].astype(np.float64)
+    p_x, z_xy, q_y = _bends(grid, row, column, window)
+    zero, one = np.zeros_like(x), np.ones_like(x)
+    # derivatives of x, y and z of a point, and of its p and q, by (w_x, w_y, w_z, t_x, t_y, t_z)
+    dx = np.stack((zero, h, -y, one, zero, zero))
+    dy = np.stack((-h, zero, x, zero, one, zero))
+    dz = np.stack((y, -x, zero, zero, zero, one))
+    dp = np.stack((p * q, -(1.0 + p * p), -q, zero, zero, zero))
+    dq = np.stack((1.0 + q * q, -p * q, p, zero, zero, zero))
+    by = np.stack((p_x * dx + z_xy * dy - dp, z_xy * dx + q_y * dy - dq, p * dx + q * dy - dz)) * units[:, None]  # (3, 6, N)
+    columns = np.concatenate((points, by.reshape(18, -1).astype(np.float32)))
+    return Points(torch.from_numpy(np.ascontiguousarray(columns)), center, units)
+
+
+def _bends(grid: Grid, row: Array, column: Array, window: Array) -> tuple[Array, Array, Array]:
+    """Second derivatives z_xx, z_xy and z_yy (N,) of pixels, 1/mm, by planes of least squares through the slopes around them.
+
+    Only pixels on the object count: the skin bends beyond the rim.
+    """
+    reach = len(window) // 2
+    channels = np.pad(grid.channels.numpy(), ((reach, reach), (reach, reach), (0, 0)))
+    matrix, right = np.zeros((len(row), 3, 3)), np.zeros((len(row), 3, 2))
+    middle = channels[row + reach, column + reach, 1:3]
+    for (i, j), share in np.ndenumerate(np.outer(window, window)):
+        near, place = channels[row + i, column + j], np.array([1.0, j - reach, reach - i])
+        weight = (share * (near[:, 3] > 0.999))[:, None, None]
+        matrix += weight * np.outer(place, place)
+        right += weight * place[:, None] * (near[:, 1:3] - middle)[:, None]
+    planes = np.linalg.solve(matrix + np.diag([1e-9, 1e-3, 1e-3]), right) / grid.pitch
+    return planes[:, 1, 0], 0.5 * (planes[:, 2, 0] + planes[:, 1, 1]), planes[:, 2, 1]
+
+
+def bare_points(grid: Grid) -> Points:
+    """All pixels on the object, without derivatives: for scores."""
+    return Points(torch.from_numpy(grid.points(*grid.pixels())), np.zeros(3), np.ones(6))
 
 
 def refine(
-    field: Field, pixels: Pixels, pose: Array, steps: int, wide: float, held: Array | None = None, small_mm: float = 1e-4
+    grid: Grid, points: Points, pose: Array, steps: int, wide: float, held: Array | None = None, small_mm: float = 1e-4
 ) -> tuple[Array, Sums]:
-    """Gauss-Newton from a pose (4, 4) of the reference in the field's frame.
+    """Gauss-Newton from a pose (4, 4) of the reference in the grid's frame.
 
     Args:
-        field: the new frame.
-        pixels: of the reference.
+        grid: the new frame.
+        points: of the reference.
         pose: to start from.
         steps: largest number of steps.
         wide: slope noise of the first step; it halves down to half as much again as the residuals.
@@ -115,13 +175,11 @@ def refine(
     Returns:
         The pose, and the sums under the pose before the last step.
     """
-    if held is None:
-        held = np.zeros((6, 0))
     noise = wide
     for _ in range(steps):
-        sums = sum_residuals(field, pixels, pose, noise)
+        sums = sum_residuals(grid, points, pose, noise)
         step = solve_step(sums, held)
-        pose = pose @ moved_by(pixels, step)
+        pose = pose @ moved_by(points, step)
         noise = max(LEAST_NOISE, 1.5 * sums.slope_noise, 0.5 * noise)
         if float(np.abs(step).max()) < small_mm:
             break
@@ -147,45 +205,55 @@ def solve_step(sums: Sums, held: Array | None = None) -> Array:
     return step
 
 
-def moved_by(pixels: Pixels, step: Array) -> Array:
+def moved_by(points: Points, step: Array) -> Array:
     """The rigid motion (4, 4) of a scaled twist."""
-    return rigid_motion(step * pixels.units, pixels.center)
+    return rigid_motion(step * points.units, points.center)
 
 
-def step_between(pixels: Pixels, pose: Array, other: Array) -> Array:
+def step_between(points: Points, pose: Array, other: Array) -> Array:
     """The scaled twist (6,) after which, by :func:`moved_by`, a pose (4, 4) is another one."""
     moved = inverted(pose) @ other
     turn = moved[:3, :3]
-    twist = np.concatenate((rotation_vector(turn), moved[:3, 3] - pixels.center + turn @ pixels.center))
-    step: Array = twist / pixels.units
+    twist = np.concatenate((rotation_vector(turn), moved[:3, 3] - points.center + turn @ points.center))
+    step: Array = twist / points.units
     return step
 
 
-def sum_residuals(field: Field, pixels: Pixels, pose: Array, slope_noise: float, score_only: bool = False) -> Sums:
-    """Sums of one Gauss-Newton step with Cauchy's weights, and the score of the pose (4, 4), from the reference to the field."""
+def score_pose(grid: Grid, points: Points, own_grid: Grid, own_points: Points, pose: Array) -> Score:
+    """Score of a pose of ``points`` in ``grid``, and back, of the new frame's own points in the reference's ``own_grid``."""
+    forth = sum_residuals(grid, points, pose, SLOPE_NOISE, score_only=True)
+    back = sum_residuals(own_grid, own_points, inverted(pose), SLOPE_NOISE, score_only=True)
+    compared = max(forth.compared + back.compared, 1.0)
+    fitness = (forth.fitness * forth.compared + back.fitness * back.compared) / compared
+    overlap = max(forth.compared / max(points.number, 1), back.compared / max(own_points.number, 1))
+    return Score(fitness, overlap, (forth.cost * forth.compared + back.cost * back.compared) / compared)
+
+
+def sum_residuals(grid: Grid, points: Points, pose: Array, slope_noise: float, score_only: bool = False) -> Sums:
+    """Sums of one Gauss-Newton step with Cauchy's weights, and the score of the pose (4, 4), from the reference to the grid."""
     by = tracking.alignment_sums if library() is not None else alignment_sums
-    return sums_of(by(field.channels, pixels.columns, residual_limits(field, pose, slope_noise), score_only), slope_noise)
+    return sums_of(by(grid.channels, points.columns, residual_limits(grid, pose, slope_noise), score_only), slope_noise)
 
 
-def sum_parts(field: Field, pixels: Pixels, pose: Array, slope_noise: float, parts: int) -> tuple[Sums, Array, Array]:
+def sum_parts(grid: Grid, points: Points, pose: Array, slope_noise: float, parts: int) -> tuple[Sums, Array, Array]:
     """:func:`sum_residuals`, and the matrices (parts, 6, 6) and right sides (parts, 6) of as many runs of pixels."""
-    limits = residual_limits(field, pose, slope_noise)
+    limits = residual_limits(grid, pose, slope_noise)
     if library() is not None:
-        found = tracking.part_sums(field.channels, pixels.columns, parts, limits)
+        found = tracking.part_sums(grid.channels, points.columns, parts, limits)
     else:
-        ends = [pixels.number * k // parts for k in range(parts + 1)]
-        runs = [pixels.columns[:, first:end] for first, end in pairwise(ends)]
-        found = np.stack([alignment_sums(field.channels, run, limits) for run in runs])
+        ends = [points.number * k // parts for k in range(parts + 1)]
+        runs = [points.columns[:, first:end] for first, end in pairwise(ends)]
+        found = np.stack([alignment_sums(grid.channels, run, limits) for run in runs])
     products = found[:, :49].reshape(parts, 7, 7)
     return sums_of(found.sum(0), slope_noise), products[:, :6, :6], products[:, :6, 6]
 
 
-def residual_limits(field: Field, pose: Array, slope_noise: float) -> Array:
+def residual_limits(grid: Grid, pose: Array, slope_noise: float) -> Array:
     """What the residuals depend on beside the pixels, (25,)."""
     limits = np.empty(25)
     limits[:16] = pose.ravel()
     limits[16:] = (
-        field.x0, field.y0, field.pitch, slope_noise**-2, DEPTH_DRIFT_MM**-2, *SCORE, DEEP_MM, SHALLOW_MM,
+        grid.x0, grid.y0, grid.pitch, slope_noise**-2, DEPTH_DRIFT_MM**-2, *SCORE, DEEP_MM, SHALLOW_MM,
     )  # fmt: skip
     return limits
 
@@ -199,41 +267,63 @@ def sums_of(total: Array, slope_noise: float) -> Sums:
     return Sums(matrix[:6, :6], matrix[:6, 6], int(count), slope, depth, bad / most, good / most, compared, slope_noise)
 
 
+class Residuals(NamedTuple):
+    """Of the pixels of a reference under one pose.
+
+    Attributes:
+        values: (3, N), the new frame's p, q and z minus the reference's.
+        height: (N,), z of the pixel under the pose.
+        inside: (N,) bool, where the new frame surely lies on the object.
+        seen: (N,) bool, where the new frame has its pixel and says whether it does.
+    """
+
+    values: Image
+    height: Image
+    inside: Mask
+    seen: Mask
+
+
+def residuals(channels: Tensor, columns: Tensor, limits: Array) -> Residuals:
+    """Residuals of pixels (5 or 23, N) under the pose in ``limits``, in the plain way."""
+    place, (x0, y0, pitch) = limits[:16].reshape(4, 4).astype(np.float32), limits[16:19].tolist()
+    turn, rows = place[:3, :3], columns[:5].numpy()
+    x, y, height = turn @ rows[:3] + place[:3, 3:]
+    column, row = (x - x0) / pitch, (y0 - y) / pitch
+    flat, (high, wide) = channels.numpy().reshape(-1, 4), channels.shape[:2]
+    within = (column >= 0) & (column <= wide - 1) & (row >= 0) & (row <= high - 1)
+    left, top = column.astype(np.int64).clip(0, wide - 2), row.astype(np.int64).clip(0, high - 2)
+    along, down, first = (column - left)[:, None], (row - top)[:, None], top * wide + left
+    upper = flat[first] + along * (flat[first + 1] - flat[first])
+    lower = flat[first + wide] + along * (flat[first + wide + 1] - flat[first + wide])
+    z, p, q, mask = (upper + down * (lower - upper)).T
+    back = turn.T @ np.stack((-p, -q, np.ones_like(p)))
+    values = np.stack((*(-back[:2] / np.maximum(back[2], 0.05) - rows[3:5]), z - height))
+    inside = within & (mask > 0.999)
+    return Residuals(values, height, inside, inside | (within & (mask <= 0.001)))
+
+
 def alignment_sums(channels: Tensor, columns: Tensor, limits: Array, score_only: bool = False) -> Array:
     """Sums (56,) float64: 7 x 7 products of the Jacobian and the residual, zero with ``score_only``, then seven of the score."""
-    place, n = torch.from_numpy(limits[:16].reshape(4, 4)).float(), limits[16:].tolist()
-    rotation, shift, rows = place[:3, :3], place[:3, 3], columns.T
-    height, width = channels.shape[:2]
-    moved = rows[:, :3] @ rotation.T + shift
-    column, row = (moved[:, 0] - n[0]) / n[2], (n[1] - moved[:, 1]) / n[2]
-    seen = (column >= 0) & (column <= width - 1) & (row >= 0) & (row <= height - 1)
-    rows, moved, column, row = rows[seen], moved[seen], column[seen], row[seen]
-    z, p, q, mask = _between(channels, row, column).unbind(1)
-    inside, near = mask > 0.999, mask > 0.001
-    back = torch.stack((-p, -q, torch.ones_like(p)), 1) @ rotation
-    slope = -back[:, :2] / back[:, 2:].clamp_min(0.05) - rows[:, 3:5]
-    residual = torch.cat((slope, (z - moved[:, 2])[:, None]), 1)  # (N, 3)
-    off, high = slope.square().sum(1), residual[:, 2].square()
-    counted = (moved[:, 2] > n[7]) & (inside | ~near)
-    error = torch.where(inside, off * n[5] + high * n[6], 1.0).clamp_max(1.0)
-    used = inside & (moved[:, 2] > n[8])
-    weight = used / (1.0 + 0.25 * (off * n[3] + high * n[4]))
-    products = torch.zeros(7, 7, dtype=torch.float64)
+    found = residuals(channels, columns, limits)
+    per_slope, per_height, score_slope, score_height, deep, shallow = limits[19:].astype(np.float32)
+    off, high = np.square(found.values[:2]).sum(0), np.square(found.values[2])
+    counted = found.seen & (found.height > deep)
+    error = np.where(found.inside, np.minimum(off * score_slope + high * score_height, 1.0), 1.0)[counted]
+    used = found.inside & (found.height > shallow)
+    weight = used / (1.0 + 0.25 * (off * per_slope + high * per_height))
+    products = np.zeros((7, 7))
     if not score_only:
-        lines = torch.cat((rows[:, 5:].reshape(-1, 3, 6), residual[..., None]), 2)
-        scaled = lines * (weight[:, None, None] * lines.new_tensor([n[3], n[3], n[4]])[:, None])
-        products = torch.einsum("nri,nrk->ik", scaled.double(), lines.double())
-    score = [used.sum(), weight.sum(), (weight * off).sum(), (weight * high).sum()]
-    score += [error[counted].sum(), (error[counted] < 1.0).sum(), counted.sum()]
-    total: Array = torch.cat((products.reshape(-1), torch.stack([s.double() for s in score]))).numpy()
-    return total
+        lines = np.concatenate((columns[5:].numpy().reshape(3, 6, -1), found.values[:, None]), 1).astype(np.float64)  # (3, 7, N)
+        scale = np.array([per_slope, per_slope, per_height])[:, None] * weight
+        products = np.einsum("rin,rn,rkn->ik", lines, scale, lines, optimize=True)
+    score = [used.sum(), weight.sum(), (weight * off).sum(), (weight * high).sum(), error.sum(), (error < 1.0).sum(), counted.sum()]
+    return np.concatenate((products.ravel(), np.array(score, np.float64)))
 
 
-def _between(channels: Tensor, row: Tensor, column: Tensor) -> Tensor:
-    """The channels (N, 4) between pixels, bilinearly."""
-    height, width = channels.shape[:2]
-    top, left = row.long().clamp_max(height - 2), column.long().clamp_max(width - 2)
-    down, along = (row - top)[:, None], (column - left)[:, None]
-    upper = (1 - along) * channels[top, left] + along * channels[top, left + 1]
-    lower = (1 - along) * channels[top + 1, left] + along * channels[top + 1, left + 1]
-    return (1 - down) * upper + down * lower
+def covariance_after(points: Points, pose: Array, scaled: Array) -> Array:
+    """Covariance of a small motion after the pose, rad and mm, from that of a scaled twist before it."""
+    to_origin = np.diag(points.units)
+    to_origin[3:, :3] = cross(points.center) @ to_origin[:3, :3]
+    after = adjoint(pose) @ to_origin
+    covariance: Array = after @ scaled @ after.T
+    return covariance

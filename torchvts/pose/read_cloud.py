@@ -26,9 +26,7 @@ def open3d() -> Any:
     try:
         import open3d as o3d
     except (ImportError, OSError) as error:
-        raise ImportError(
-            f"clouds in files, and those that are no height maps, need Open3D and libusb: pip install 'torchvts[pose]' ({error})"
-        ) from error
+        raise ImportError(f"point clouds need Open3D and libusb: pip install 'torchvts[pose]' ({error})") from error
     return o3d
 
 

@@ -14,7 +14,7 @@ class Registration:
 
     Attributes:
         T_target_source: (4, 4) float64, a rigid motion.
-        rmse_mm: root mean square distance along the surface normal, over the part where both agree, mm.
+        rmse_mm: root mean square difference over the part where both agree, mm: of heights, of clouds along the normal.
         fitness: share of the common contact that agrees, 0 to 1.
         converged: whether the pose can be trusted, except for what ``ambiguous`` and ``alternatives`` list.
         message: the reason, in one sentence.
@@ -23,7 +23,7 @@ class Registration:
         ambiguous: names of the motions under which the surface slides on itself; empty if there is none.
         alternatives: (4, 4) poses that fit equally well because the object is symmetric, and differ by more than motions of
             ``ambiguous``; the best pose is not among them.
-        overlap: share of the smaller contact that could be compared, 0 to 1; 1 for clouds that are no height maps.
+        overlap: share of the smaller contact that could be compared, 0 to 1; 1 for clouds.
     """
 
     T_target_source: Tensor

@@ -66,3 +66,15 @@ def cross(v: Array) -> Array:
     result = np.zeros((*v.shape, 3))
     result[..., 2, 1], result[..., 0, 2], result[..., 1, 0] = v[..., 0], v[..., 1], v[..., 2]
     return result - result.swapaxes(-1, -2)
+
+
+def distance_mm(spread: Array, one: Array, other: Array) -> float:
+    """Root mean square distance of points under two poses (4, 4), mm, by the mean of the products (4, 4) of (x, y, z, 1)."""
+    off = one[:3] - other[:3]
+    return math.sqrt(max(float(np.vdot(off @ spread, off)), 0.0))
+
+
+def moved_covariance(pose: Array, covariance: Array) -> Array:
+    """Covariance (6, 6) of a small motion before a pose (4, 4), as one after it."""
+    by = adjoint(pose)
+    return by @ covariance @ by.T

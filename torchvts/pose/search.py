@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import affine_grid, grid_sample, max_pool1d
 
-from .relief import Relief
+from .grids import Grid
 
 STEP_DEG = 5.0
 """Step of the rotations; half of it moves the rim of a contact of 10 mm by a fifth of a millimetre, which refinement corrects."""
@@ -35,16 +35,16 @@ class _Peak(NamedTuple):
     column: int
 
 
-def search_plane(source: Relief, target: Relief, most: int = 48, angle: Tensor | None = None) -> tuple[Tensor, Tensor]:
-    """Find the in-plane rotations and shifts under which the slopes of two reliefs agree best.
+def search_plane(source: Grid, target: Grid, most: int = 48, angle: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    """Find the in-plane rotations and shifts under which the slopes of two grids agree best.
 
     The two slopes of a pixel form one complex number. The sum of products over a shift is large where the slopes point the same
     way; it is divided by the energy of both in the common part (masked correlation). An added plane or a deeper press changes
     the score little, because both change few slopes.
 
     Args:
-        source: the relief that is moved.
-        target: the relief that stays, of the same pitch.
+        source: the grid that is moved.
+        target: the grid that stays, of the same pitch.
         most: number of hypotheses.
         angle: the rotations to try, rad, each by itself; if None, all around in steps of :data:`STEP_DEG`.
     Returns:
@@ -113,18 +113,18 @@ def _largest_around(values: Tensor, dim: int, reach: int) -> Tensor:
     return max_pool1d(around.flatten(0, -2), 2 * reach + 1, 1).reshape(lines.shape).movedim(-1, dim)
 
 
-def _square(relief: Relief, rotatable: bool = False) -> _Square:
+def _square(grid: Grid, rotatable: bool = False) -> _Square:
     """Put the contact's bounding box into the middle of a square; ``rotatable``: large enough to turn the box in it."""
-    rows, columns = torch.nonzero(relief.inside.any(1))[:, 0], torch.nonzero(relief.inside.any(0))[:, 0]
-    top, bottom, left, right = int(rows[0]), int(rows[-1]), int(columns[0]), int(columns[-1])
+    row, column = grid.pixels()
+    top, bottom, left, right = int(row.min()), int(row.max()), int(column.min()), int(column.max())
     high, wide = bottom - top + 1, right - left + 1
     side = math.ceil(math.hypot(high, wide)) if rotatable else max(high, wide)
     side += 2 + side % 2
-    mask = relief.inside[top : bottom + 1, left : right + 1].float()
-    slopes = relief.field[1:3, top : bottom + 1, left : right + 1] * mask
     channels = torch.zeros(3, side, side, dtype=torch.float32)
-    row, column = side // 2 - (top + bottom) // 2 - 1 + top, side // 2 - (left + right) // 2 - 1 + left
-    channels[:, row : row + high, column : column + wide] = torch.cat((slopes, mask[None]))
+    down, along = side // 2 - (top + bottom) // 2 - 1, side // 2 - (left + right) // 2 - 1
+    at = torch.from_numpy(row), torch.from_numpy(column)
+    channels[:2, at[0] + down, at[1] + along] = grid.channels[at[0], at[1], 1:3].T
+    channels[2, at[0] + down, at[1] + along] = 1.0
     # between pixels, as the middle of a square of even side
-    x, y = ((left + right) // 2 + 0.5) * relief.pitch, ((top + bottom) // 2 + 0.5) * relief.pitch
-    return _Square(channels, (relief.x0 + x, relief.y0 - y))
+    x, y = ((left + right) // 2 + 0.5) * grid.pitch, ((top + bottom) // 2 + 0.5) * grid.pitch
+    return _Square(channels, (grid.x0 + x, grid.y0 - y))

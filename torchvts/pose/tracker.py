@@ -1,6 +1,5 @@
 """Tracking: the pose of a touched object in every frame, from its pose in the last one."""
 
-import itertools
 import math
 from collections import deque
 from dataclasses import dataclass
@@ -12,16 +11,14 @@ from torch import Tensor
 
 from ..core.checks import check_positive
 from ..core.geometry import check_rigid
-from .alignment import LEAST_FITNESS, LEAST_OVERLAP, MOST_COST, agrees_enough
-from .ambiguity import UNKNOWN_VARIANCE, turned_otherwise
-from .direct import align, symmetries
+from .ambiguity import UNKNOWN_VARIANCE
+from .direct import equal_poses, likely_poses, message_of, symmetries
 from .follow import TRUSTED_DEG, TRUSTED_MM, Followed, follow, in_common
-from .graph import Edge, KeyframeGraph, moved_covariance
-from .inverse import LEAST_NOISE
-from .keyframe import Contact, Grids, Unusable, contact_frame, grids, make_keyframe, pitch_by_slopes, slopes_of_contact
-from .relief import DepthFrame, levels
+from .grids import LEAST_CELLS, DepthFrame, Grids, Surface, Unusable, grids, pitch_by_slopes, surface_of
+from .inverse import LEAST_FITNESS, LEAST_NOISE, LEAST_OVERLAP, MOST_COST
+from .keyframe import KeyframeGraph, make_keyframe
 from .result import Registration
-from .rigid import Array, cross, inverted, orthonormal
+from .rigid import Array, cross, distance_mm, inverted, moved_covariance, orthonormal
 
 ENOUGH, RETURN = 0.5, 0.6
 """Share of the smaller contact in common below which a new keyframe is taken, and from which an older one is used again."""
@@ -40,14 +37,6 @@ GROWN = 2.0
 
 JUMP_MM = 1.0
 """Motion of the contact between frames, beside the expected one, beyond which a pose is not taken: another one may look alike."""
-
-SAME_MM, MOST_TRIED = 0.4, 72
-"""Poses that move the contact to so nearly the same place are one, mm; and so many starts are tried for equal poses at most."""
-
-EQUAL, EQUAL_COST = 2.3, 0.008
-"""Poses are equal whose costs on the fine grid are within so many times the least one, or so much more. A bolt head turned by 10
-to 30 degrees, of which hardly more than the outline says so, has 3 times that or more; where slopes err by 3 degrees its equal
-poses have up to 2.2."""
 
 RISE = 3.0
 """A residual of so many times the usual one of a track is no noise."""
@@ -129,11 +118,8 @@ class PoseTracker:
 
     def reset(self, reference: DepthFrame) -> None:
         """Begin anew with another reference; all keyframes are forgotten."""
-        try:
-            frame = contact_frame(reference, "reference")
-        except Unusable as error:
-            raise ValueError(f"reference: expected a contact with relief, got none: {error}") from None
-        slope = slopes_of_contact(frame)
+        frame = surface_of(reference, "reference")
+        slope = float(frame.gradient[0][:, frame.contact[0, 0]].square().mean().sqrt())
         if slope < LEAST_SLOPE:
             raise ValueError(f"reference: expected a contact with relief, got slopes of {slope:.2g}: a flat face shows no motion")
         keyframe = make_keyframe(frame, self.mm_per_pixel)
@@ -176,20 +162,20 @@ class PoseTracker:
             ValueError: not one frame.
         """
         try:
-            contact = contact_frame(frame)
-            size = tuple(contact.depth_mm.shape[-2:])
-            if size != self._size:
-                expected = f"expected {self._size[0]} x {self._size[1]} pixels like the reference"
-                raise Unusable(f"{expected}, got {size[0]} x {size[1]}: of another sensor, or cut out?")
+            contact = surface_of(frame)
         except Unusable as error:
-            return self._lose(str(error))
-        reference = self.graph.keyframes[0]
-        made = grids(contact, self.mm_per_pixel, reference.least_mm, reference.times)
-        if made.touching < 12:
-            return self._lose(f"hardly any contact deeper than {reference.least_mm:.2g} mm", contact)
+            return self._lose(error.reason)
+        size = tuple(contact.depth_mm.shape[-2:])
+        if size != self._size:
+            expected = f"expected {self._size[0]} x {self._size[1]} pixels like the reference"
+            return self._lose(f"{expected}, got {size[0]} x {size[1]}: of another sensor, or cut out?")
+        resolution = self.graph.keyframes[0].resolution
+        made = grids(contact, self.mm_per_pixel, resolution)
+        if made.touching < LEAST_CELLS:
+            return self._lose(f"hardly any contact deeper than {resolution.least_mm:.2g} mm", contact)
         return self._track(contact, made) if self._tracking else self._search(contact, made)
 
-    def _track(self, contact: Contact, frame: Grids) -> TrackedPose:
+    def _track(self, contact: Surface, frame: Grids) -> TrackedPose:
         """Follow the object from its last pose."""
         last = self._poses[-1]
         starts = [last] if len(self._poses) < 2 else [last, last @ inverted(self._poses[0]) @ last]
@@ -218,7 +204,7 @@ class PoseTracker:
         most = self._way[self._active] + variance
         for k in range(self._active):
             share, variance = self._in_common(k, frame, expected)
-            few = frame.touching < GROWN * self.graph.keyframes[k].touching
+            few = frame.touching < GROWN * self.graph.keyframes[k].grids.touching
             if few and share > RETURN and self._way[k] + variance < most:
                 return k
         return None
@@ -230,24 +216,27 @@ class PoseTracker:
     def _close_loop(self, older: int, found: Followed, also: Followed, starts: list[Array]) -> None:
         """Link the present keyframe with an older one by a frame that is registered to both, and go on with the older one."""
         if not self._problem(self._active, also, starts):
-            pose = inverted(also.pose) @ found.pose
-            covariance = moved_covariance(inverted(also.pose), found.covariance + also.covariance)
-            twist = self.graph.close(Edge(older, self._active, orthonormal(pose), covariance))
+            back = inverted(also.pose)
+            covariance = moved_covariance(back, found.covariance + also.covariance)
+            twist = self.graph.close(self._active, older, back @ found.pose, covariance)
             middle = twist[3:] + np.cross(twist[:3], self.graph.keyframes[self._active].many.center)
             self.closures.append((math.degrees(float(np.linalg.norm(twist[:3]))), float(np.linalg.norm(middle))))
         self._active, self._least = older, math.inf
 
+    def _most_cost(self) -> float:
+        """Of a pose that is taken: more, where the slopes of the sensor err."""
+        return max(MOST_COST, COST_RISE * median(cost for _, cost in self._usual)) if len(self._usual) >= 3 else MOST_COST
+
     def _problem(self, index: int, found: Followed, starts: list[Array]) -> str:
         """Why a pose cannot be trusted; empty if it can."""
-        costs = [cost for _, cost in self._usual]
-        most_cost = max(MOST_COST, COST_RISE * median(costs) if len(costs) >= 3 else 0.0)
-        if not agrees_enough(found.fitness, found.overlap, found.cost * (MOST_COST / most_cost)):
-            common = f"{100 * found.overlap:.0f} % of the smaller contact in common"
-            if found.fitness >= LEAST_FITNESS and found.overlap < LEAST_OVERLAP:
+        most_cost, (fitness, overlap, cost) = self._most_cost(), found.score
+        if not found.score.is_enough(most_cost):
+            common = f"{100 * overlap:.0f} % of the smaller contact in common"
+            if fitness >= LEAST_FITNESS and overlap < LEAST_OVERLAP:
                 return f"too little to compare near the last pose, {common}: lifted, another part of the object, or a jump"
-            agrees = f"{100 * found.fitness:.0f} % of what is compared agrees, {common}"
-            if found.cost > most_cost:
-                agrees += f", mean truncated residual {found.cost:.2f}, {most_cost:.2f} at most"
+            agrees = f"{100 * fitness:.0f} % of what is compared agrees, {common}"
+            if cost > most_cost:
+                agrees += f", mean truncated residual {cost:.2f}, {most_cost:.2f} at most"
             return f"nothing fits near the last pose: {agrees}: another part of the object, a jump, or another object"
         usual = median([slope for slope, _ in self._usual]) if len(self._usual) >= 3 else math.inf
         if found.fine.slope_noise > max(RISE * usual, LEAST_NOISE):
@@ -255,37 +244,34 @@ class PoseTracker:
         if found.free.shape[1] == 6:
             return "the contact is too small: no motion of it is known"
         spread, to_reference = self.graph.keyframes[index].spread, inverted(self.graph.poses[index])
-        moved = min(_distance(spread, found.pose, start @ to_reference) for start in starts)
+        moved = min(distance_mm(spread, found.pose, start @ to_reference) for start in starts)
         if moved > JUMP_MM:
             return f"a jump of {moved:.1f} mm at the contact: another pose may look alike"
         return ""
 
-    def _search(self, contact: Contact, frame: Grids) -> TrackedPose:
+    def _search(self, contact: Surface, frame: Grids) -> TrackedPose:
         """Search for the object everywhere and near its last pose, by the reference and by the present keyframe."""
-        try:
-            reliefs = levels(contact, self.mm_per_pixel, "frame")
-        except ValueError as error:
-            return self._lose(str(error), contact)
-        message = ""
-        for index in dict.fromkeys((0, self._active)):
-            registered = align(self.graph.keyframes[index].levels, reliefs, None)
-            chain = self.graph.poses[index]
-            starts = [T.numpy() @ chain for T in (registered.T_target_source, *registered.alternatives) if registered.converged]
-            equal, problem = self._equal_poses(index, frame, [*starts, self._poses[-1]])
+        message = "" if len(frame.coarse.pixels()[0]) >= LEAST_CELLS else "hardly any contact"
+        for index in dict.fromkeys(() if message else (0, self._active)):
+            keyframe, chain = self.graph.keyframes[index], self.graph.poses[index]
+            back, spread = inverted(chain), self.graph.keyframes[0].spread
+            starts = [*likely_poses(keyframe, frame), self._poses[-1] @ back]
+            motions = [chain @ motion @ back for motion in self._reference_symmetries()]
+            equal = equal_poses(keyframe, frame, starts, motions, self._most_cost())
+            problems = [self._problem(index, one, [one.pose @ chain]) for one in equal]
+            equal = [one for one, problem in zip(equal, problems, strict=True) if not problem]
             if not equal:
-                message = message or (problem if starts else registered.message)
+                message = message or next(iter(problems), message_of(follow(keyframe, frame, starts[:1]).score, False))
                 continue
-            spread = self.graph.keyframes[0].spread
-            found = min(equal, key=lambda one: _distance(spread, one.pose @ chain, self._poses[-1]))
-            keyframe = self.graph.keyframes[index]
-            if found.free.shape[1] > keyframe.held.shape[1]:
-                message = f"it touches, but too little to show its {', '.join(found.names)}"
+            found = min(equal, key=lambda one: distance_mm(spread, one.pose @ chain, self._poses[-1]))
+            vaguest = max(equal, key=lambda one: one.free.shape[1])
+            if vaguest.free.shape[1] > keyframe.held.shape[1]:
+                message = f"it touches, but too little to show its {', '.join(vaguest.names)}"
                 continue  # what is unknown now would keep a value of long ago
-            if not found.exact and frame.touching < LEAST_CONTACT * keyframe.touching:
+            if not found.exact and frame.touching < LEAST_CONTACT * keyframe.grids.touching:
                 message = "it touches with a small part, which other parts of the object may look like"
                 continue
-            back = inverted(found.pose @ chain)
-            self._symmetries = [back @ one.pose @ chain for one in equal if one is not found]
+            self._symmetries = [inverted(found.pose @ chain) @ one.pose @ chain for one in equal if one is not found]
             self._poses = self._on_the_way(found.pose @ chain)
             self._active, self._least, self._tracking = index, math.inf, True
             return self._accept(contact, frame, found)
@@ -298,98 +284,33 @@ class PoseTracker:
         if self._missed is None:
             return []
         expected = self._missed @ inverted(self._poses[-1]) @ self._missed
-        return [self._missed] if _distance(self.graph.keyframes[0].spread, expected, pose) < JUMP_MM else []
-
-    def _equal_poses(self, index: int, frame: Grids, starts: list[Array]) -> tuple[list[Followed], str]:
-        """All poses that could be the object's, from some starts on, and if there is none, why.
-
-        The motions between them are symmetries of the object, and so are the products of these, which are tried too: where slopes
-        err, a search finds a few of the twelve poses of a gear, or one. Which of them fits best is then chance.
-        """
-        chain, spread = self.graph.poses[index], self.graph.keyframes[0].spread
-        found: list[Followed] = []
-        tried: list[Array] = []
-        problem = ""
-        waiting = deque(starts)
-        while waiting and len(tried) < MOST_TRIED:
-            start = waiting.popleft()
-            if any(_distance(spread, start, other) < SAME_MM for other in tried):
-                continue
-            one = self._follow(index, frame, [start])
-            pose = one.pose @ chain
-            known = [other.pose @ chain for other in found]
-            tried.append(start)
-            wrong = self._problem(index, one, [start])
-            problem = problem or wrong
-            if wrong or any(_distance(spread, pose, other) < SAME_MM for other in known):
-                continue
-            found.append(one)
-            if one.names:
-                found += self._turned_otherwise(index, frame, one)
-                break  # products of symmetries would differ by what is unknown
-            if not known:
-                waiting.extend(pose @ other for other in self._reference_symmetries())
-            for first, second in itertools.product([*known, pose], repeat=2):
-                if pose is first or pose is second:
-                    waiting.append(first @ inverted(known[0] if known else pose) @ second)
-        if not found:
-            return [], problem
-        best = min(found, key=lambda one: one.fine.cost)
-        back = inverted(best.pose @ chain)
-        equal = [
-            one
-            for one in found
-            if _equals(one.fine.cost, best.fine.cost)
-            or (_equals(one.cost, best.cost) and self._is_symmetry(back @ one.pose @ chain))
-        ]
-        return equal, problem
-
-    def _turned_otherwise(self, index: int, frame: Grids, one: Followed) -> list[Followed]:
-        """Poses beside one of which some motions are unknown: a capsule that has rolled may point the other way."""
-        chain = self.graph.poses[index]
-        motions = [chain @ motion @ inverted(chain) for motion in self._reference_symmetries()]
-        found = []
-        for k in turned_otherwise([motion[:3, :3] for motion in motions], one.free[:3], one.names):
-            start = one.pose @ motions[k] @ chain
-            other = self._follow(index, frame, [start])
-            if not self._problem(index, other, [start]):
-                found.append(other)
-        return found
-
-    def _is_symmetry(self, motion: Array) -> bool:
-        """Whether the reference looks much the same after a motion.
-
-        Of a symmetric object that is tilted otherwise than the reference, other pixels touch: the fine grid counts them, the less
-        the nearer the tilts are.
-        """
-        spread = self.graph.keyframes[0].spread
-        return any(_distance(spread, motion, symmetry) < SAME_MM for symmetry in self._reference_symmetries())
+        return [self._missed] if distance_mm(self.graph.keyframes[0].spread, expected, pose) < JUMP_MM else []
 
     def _reference_symmetries(self) -> list[Array]:
         """Motions after which the reference looks much the same: continuity is lost, so each of them may have happened."""
         if self._symmetries_of_reference is None:
-            self._symmetries_of_reference = [T.numpy() for T in symmetries(self.graph.keyframes[0].levels)]
+            self._symmetries_of_reference = symmetries(self.graph.keyframes[0])
         return self._symmetries_of_reference
 
-    def _accept(self, contact: Contact, frame: Grids, found: Followed) -> TrackedPose:
+    def _accept(self, contact: Surface, frame: Grids, found: Followed) -> TrackedPose:
         """Keep a pose, take a keyframe if it is time, and describe the pose."""
         graph, index = self.graph, self._active
         pose = orthonormal(found.pose @ graph.poses[index])
         drift, drift_deg, drift_mm = self._drift(found)
         self._poses = [*self._poses[-1:], pose]
         keyframe = graph.keyframes[index]
-        if _distance(keyframe.spread, found.pose, np.eye(4)) > MOVED_MM:
-            self._usual.append((found.fine.slope_noise, found.cost))
-        large = frame.touching > LEAST_CONTACT * graph.keyframes[0].touching
-        grown = frame.touching > GROWN * keyframe.touching
-        share, variance = found.common
+        if distance_mm(keyframe.spread, found.pose, np.eye(4)) > MOVED_MM:
+            self._usual.append((found.fine.slope_noise, found.score.cost))
+        large = frame.touching > LEAST_CONTACT * graph.keyframes[0].grids.touching
+        grown = frame.touching > GROWN * keyframe.grids.touching
+        share, variance = in_common(keyframe, frame, found.pose)
         self._least = min(self._least, variance)
         moved_on, vague = large and share < ENOUGH, large and variance > VAGUER * self._least
         if (grown or moved_on or vague) and found.free.shape[1] <= keyframe.held.shape[1]:  # else what is unknown now would stay so
             self._take_keyframe(contact, found, variance, math.inf if grown or moved_on else GAIN * variance)
         std_deg, std_mm = math.hypot(found.std_deg, drift_deg), math.hypot(found.std_mm, drift_mm)
         exact = found.exact and 3.0 * std_deg <= TRUSTED_DEG and 3.0 * std_mm <= TRUSTED_MM
-        message = f"{100 * found.fitness:.0f} % of the common contact agrees"
+        message = f"{100 * found.score.fitness:.0f} % of the common contact agrees"
         if found.names:
             message += f"; kept, because the surface slides on itself: {', '.join(found.names)}"
         if not exact:
@@ -401,13 +322,13 @@ class PoseTracker:
         return TrackedPose(
             T_target_source=torch.from_numpy(pose.copy()),
             rmse_mm=found.fine.depth_noise,
-            fitness=found.fitness,
+            fitness=found.score.fitness,
             converged=exact,
             message=message,
             covariance=torch.from_numpy(found.covariance + drift),
             ambiguous=found.names,
             alternatives=[torch.from_numpy(pose @ other) for other in self._symmetries],
-            overlap=found.overlap,
+            overlap=found.score.overlap,
             keyframe=index,
             drift_deg=drift_deg,
             drift_mm=drift_mm,
@@ -424,7 +345,7 @@ class PoseTracker:
         degrees = math.degrees(math.sqrt(float(np.trace(drift[:3, :3]))))
         return drift, degrees, math.sqrt(float(np.trace(to_center @ drift @ to_center.T)))
 
-    def _take_keyframe(self, contact: Contact, found: Followed, variance: float, most: float) -> None:
+    def _take_keyframe(self, contact: Surface, found: Followed, variance: float, most: float) -> None:
         """Go on with a frame as keyframe, if beside itself it has at most such a variance."""
         try:
             keyframe = make_keyframe(contact, self.mm_per_pixel)
@@ -436,7 +357,7 @@ class PoseTracker:
         self._way.append(self._way[self._active] + variance)
         self._active, self._least = self.graph.add(keyframe, self._active, found.pose, found.covariance), math.inf
 
-    def _lose(self, reason: str, contact: Contact | None = None) -> TrackedPose:
+    def _lose(self, reason: str, contact: Surface | None = None) -> TrackedPose:
         """No pose: the last one, as of no certainty, and the next frame is searched.
 
         The reason may be that the frame has another pitch, or unit.
@@ -449,13 +370,3 @@ class PoseTracker:
         unknown = torch.eye(6, dtype=torch.float64) * UNKNOWN_VARIANCE
         last = torch.from_numpy(self._poses[-1].copy())
         return TrackedPose(last, math.inf, 0.0, False, f"lost: {reason}", unknown, overlap=0.0, lost=reason, keyframe=self._active)
-
-
-def _equals(cost: float, least: float) -> bool:
-    return cost < max(EQUAL * least, least + EQUAL_COST)
-
-
-def _distance(spread: Array, one: Array, other: Array) -> float:
-    """Root mean square distance of points under two poses (4, 4), mm, by the mean of their products (4, 4)."""
-    off = one[:3] - other[:3]
-    return math.sqrt(max(float(np.vdot(off @ spread, off)), 0.0))

@@ -1,4 +1,4 @@
-/* The grids of a new frame of a track: the same results as grids of torchvts/pose/keyframe.py, which explains them. */
+/* The grids of a new frame of a track: the same results as grids of torchvts/pose/grids.py, which explains them. */
 #include "kernels.h"
 
 #define INSIDE 1

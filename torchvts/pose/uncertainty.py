@@ -1,12 +1,36 @@
-"""Uncertainty of a tracked pose: how far it moves when a part of the contact is left out."""
+"""Uncertainty of a pose: how far it moves when a part of the contact is left out, and what parts have in common."""
+
+import math
 
 import numpy as np
 
+from .inverse import Sums
 from .rigid import Array
 
 ALIKE_MM = 3.0
 """Errors of slopes at places so far from each other have a correlation of exp(-1/2). Presses of balls on two GelSight Minis and a
 DIGIT show 1.5 to 2 mm, but contacts of 3 mm hide what is alike all over them; drawn sensors with wide contacts have 3 mm."""
+
+PARTS = 8
+"""Parts of a contact, a power of two: a pose is as uncertain as it depends on which of them is left out."""
+
+UNSEEN = math.sqrt(2.0 / (5 * (PARTS - 1)))
+"""Standard deviation, as a share, of the variance that so many parts show in the five motions that slopes show."""
+
+LEAST_SLOPE_NOISE = 1e-3
+"""Slopes of pixels err by so much at least."""
+
+
+def in_parts(places: Array) -> Array:
+    """An order of places (N, 2) in which PARTS runs of the same number are compact: halves of halves, across the longer side."""
+    runs = [np.arange(len(places))]
+    while len(runs) < PARTS:
+        halves: list[Array] = []
+        for run in runs:
+            side = int(np.ptp(places[run], axis=0).argmax()) if len(run) else 0
+            halves += np.array_split(run[places[run, side].argsort(kind="stable")], 2)
+        runs = halves
+    return np.concatenate(runs)
 
 
 def shared_error(places: Array, parts: int) -> float:
@@ -64,3 +88,29 @@ def jackknife(matrices: Array, rights: Array, known: Array) -> Array:
     off = (without - np.linalg.solve(whole + damping, right)) @ known.T
     covariance: Array = (len(off) - 1) / len(off) * off.T @ off
     return covariance
+
+
+def covariance_of_slopes(fine: Sums, matrices: Array, rights: Array, shared: float, free: Array) -> Array:
+    """Covariance of the scaled twist that slopes ask for: the noise of pixels, and what is alike in many of them.
+
+    What parts of the contact disagree by beyond the noise of pixels is alike over wide areas, and parts have much of it in common.
+    Where they disagree by no more than that noise, a smooth error may still be as large as it can be without being seen.
+
+    Args:
+        fine: sums over all pixels.
+        matrices: J^T J of each part.
+        rights: J^T r of each part.
+        shared: :func:`shared_error` of the contact.
+        free: (6, k), orthonormal scaled twists that are not determined.
+    """
+    known = np.linalg.qr(free, mode="complete")[0][:, free.shape[1] :] if free.shape[1] else np.eye(6)
+    by_parts, beside = jackknife(matrices, rights, known), known @ known.T
+    matrix = beside @ fine.matrix @ beside
+    matrix[5, :] = matrix[:, 5] = 0.0  # heights have a weight of their own
+    information, directions = np.linalg.eigh(matrix)
+    shown = information > 1e-9 * information[-1]
+    noise = (directions[:, shown] / information[shown]) @ directions[:, shown].T
+    noise *= (max(fine.slope_noise, LEAST_SLOPE_NOISE) / fine.noise) ** 2
+    alike = 1.0 - float(np.trace(noise)) / max(float(np.trace(by_parts[:5, :5])), 1e-30)
+    scaled: Array = noise + shared * (max(0.0, alike) * by_parts + UNSEEN * noise)
+    return scaled

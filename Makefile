@@ -32,7 +32,7 @@ test-coverage: setup
 test-long: setup
 	TORCHVTS_TEST_PROFILE=long $(PYTEST) -m long
 
-# The same tests on the wheel, with nothing of this folder but tests, scripts and sensor files. PYTHON=python3.13 takes another Python,
+# The same tests on the wheel, with nothing of this folder but tests, examples, scripts and sensor files. PYTHON=python3.13 takes another Python,
 # CONSTRAINTS=constraints-oldest.txt the oldest versions that pyproject.toml allows.
 CONSTRAINTS ?= constraints.txt
 WHEEL := out/wheel
@@ -44,7 +44,7 @@ test-wheel:
 	$(WHEEL)/venv/bin/python -m build --wheel --outdir $(WHEEL) .
 	$(WHEEL)/venv/bin/pip install --quiet --disable-pip-version-check --constraint $(CONSTRAINTS) "$$(ls $(WHEEL)/*.whl)[pose,onnx,test]"
 	mkdir $(WHEEL)/tree
-	cp -r tests scripts configs docs pyproject.toml README.md CHANGELOG.md LICENSE $(WHEEL)/tree
+	cp -r tests examples scripts configs docs pyproject.toml README.md CHANGELOG.md LICENSE $(WHEEL)/tree
 	cd $(WHEEL)/tree && ../venv/bin/python -m pytest -n auto --dist worksteal -m "not long" --ignore tests/pages tests
 
 check: setup

@@ -1,4 +1,4 @@
-"""Reproduce the paper's figures 3 and 4 and its tables 2 and 3, beside the values that it reports.
+"""Reproduce the paper's figure 4 and its tables 2 and 3, beside the values that it reports; examples/paper.py has figure 3.
 
 Ji, Liu, Ma: Model-Based 3D Contact Geometry Perception for Visual Tactile Sensor, Sensors 2022, 22(17), 6470.
 
@@ -15,42 +15,19 @@ from tqdm import tqdm
 import torchvts as vts
 from lab import methods, metrics, pose_accuracy
 from lab.commands import main_of, parser_of
-from lab.faults import ring_lights
 from lab.sets import data_folder
-from torchvts import scenes, viz
-from torchvts.core.tables import markdown
+from torchvts import viz
 from torchvts.pose import contact_cloud
 from torchvts.training.balls import fit_sphere
 from torchvts.training.presses import Training
 
 PITCH = 0.0625
-PAPER_3 = {16: (0.31, 0.09), 32: (1.21, 0.16)}
 TACTO = {  # largest error of the paper in px; centre and radius that it found, and the true ones, mm
     "sphere_R10_d2": ("3", "(0.031, 0.032, -7.650), 9.799", "(0, 0, -8), 10"),
     "sphere_R5_d1_off": ("", "", "(8, -5, -4), 5"),
     "cylinder_R4_d1": ("", "", ""),
     "cube_edge_d1": ("", "", ""),
 }
-
-
-def figure_3(lights: vts.PointLights, out: Path) -> list[str]:
-    rows = []
-    calibration = vts.Calibration.from_lights(lights, vts.Sensor("figure 3", 480, 640, PITCH))
-    for press_px, paper in PAPER_3.items():
-        scene = scenes.sphere_press(10.0, press_px * PITCH)
-        image = scenes.render(scene, lights).detach()
-        floor = metrics.depth_error(vts.poisson_background(scene.gradient, PITCH), scene.depth_mm, PITCH)
-        for mode, equation, reported in (("fast", "eq. 9", paper[0]), ("precise", "eq. 10", paper[1])):
-            pipe = vts.DepthPipeline.from_calibration(calibration, mode)
-            with torch.inference_mode():
-                result = pipe(image)
-            error = metrics.depth_error(result.depth_mm, scene.depth_mm, PITCH)
-            cells = [f"{reported:.2f}", f"{error.max_px:.3f}", f"{error.rms_px:.4f}", f"{floor.max_px:.3f} / {floor.rms_px:.4f}"]
-            rows.append([f"sphere R 160 px, press {press_px} px", equation, *cells])
-            figure = viz.comparison_figure(result.depth_mm, scene.depth_mm, PITCH, f"figure 3: press {press_px} px, {equation}")
-            viz.save_figure(figure, out / f"figure_3_press_{press_px}_{mode}.png")
-    titles = ["scene", "method", "paper, largest px", "ours, largest px", "RMS px", "integrator alone, largest / RMS px"]
-    return [markdown(titles, rows)]
 
 
 def figure_4(folder: Path, out: Path) -> list[str]:
@@ -133,13 +110,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--data", type=Path, default=data_folder(), help="folder that holds tacto/ (default: TORCHVTS_DATA)")
     arguments = parser.parse_args(argv)
     arguments.out.mkdir(parents=True, exist_ok=True)
-    lines = [
-        "Figure 3: exact lights known, 640 x 480, depth error over the whole image",
-        "",
-        *figure_3(ring_lights(31.25, 39.375), arguments.out),
-    ]
     tacto = arguments.data / "tacto"
-    lines += ["", "Figure 4: TACTO renders, calibrated from the one background image, precise", ""]
+    lines = ["Figure 4: TACTO renders, calibrated from the one background image, precise", ""]
     lines += figure_4(tacto, arguments.out) if tacto.is_dir() else [f"not run: no {tacto} (scripts/render_tacto.py renders it)"]
     mini = arguments.data / "gelsight_mini_a"
     lines += ["", "Table 2: a real GelSight Mini, held-out presses, RMSE between model-based and look-up depth", ""]

@@ -32,10 +32,13 @@ def command(line):
     return printed.getvalue()
 
 
-def run(path):
-    """Run a document's ``python`` blocks, which share their names, and its ``bash`` blocks; returns the names."""
+def run(path, names=()):
+    """Run a document's ``python`` blocks, which share their names, and its ``bash`` blocks; returns the names.
+
+    A document that goes on from an example is given the names of that.
+    """
     torch.manual_seed(0)  # a document's networks start somewhere
-    names = {"__name__": "document"}
+    names = {**dict(names), "__name__": "document"}
     for kind, text in blocks(path, ("python", "bash")):
         if kind == "python":
             exec(compile(text, str(path), "exec"), names)

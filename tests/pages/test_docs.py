@@ -78,7 +78,7 @@ def test_commands_of_the_documents_can_be_typed():
         options = make_parser(subcommand, importlib.import_module(f"torchvts.cli.{subcommand}"))._option_string_actions
         assert set(re.findall(r"(?<!\S)--[a-z-]+", rest)) <= set(options), f"{name}: torchvts {subcommand}{rest}"
     for path in PAGES:
-        for script in re.findall(r"scripts/\w+\.py", path.read_text()):
+        for script in re.findall(r"(?:scripts|examples)/\w+\.py", path.read_text()):
             assert (ROOT / script).is_file(), f"{path.name}: {script}"
 
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from .grids import Grid
 from .inverse import CUT, SHALLOW_MM, SLOPE_NOISE, Points, center_and_units, points_of, residual_limits, residuals
-from .rigid import Array, cross, rigid_motion
+from .rigid import Array, adjoint, rigid_motion
 
 SINE_OF_AXIS = 0.3
 """Sine of the angle to the z axis up to which a direction is called z, and of that to the skin up to which it has an angle."""
@@ -59,14 +59,12 @@ def unknown_motions(grid: Grid, points: Points, noise: float) -> Array:
     rolls = motions[:, _rolls(grid, part, motions)]
     slides = np.concatenate((np.zeros_like(shifts), shifts))  # of the whole contact; a rod rolls and slides
     rolls = span(np.hstack((slides, rolls - slides @ (slides.T @ rolls))))
-    return _of_other_center(rolls, part, points) if rolls.shape[1] > free.shape[1] else free
+    return motions_of(points, rolls, part, np.eye(4)) if rolls.shape[1] > free.shape[1] else free
 
 
-def _of_other_center(motions: Array, points: Points, other: Points) -> Array:
-    """Orthonormal scaled twists (6, k) of some points as those of others."""
-    moved = points.units[:, None] * motions
-    moved[3:] += cross(other.center - points.center).T @ moved[:3]
-    return np.linalg.qr(moved / other.units[:, None])[0]
+def motions_of(other: Points, motions: Array, points: Points, pose: Array) -> Array:
+    """Orthonormal scaled twists (6, k) of some points as those of others, which lie under a pose (4, 4) of the first."""
+    return np.linalg.qr(np.linalg.solve(other.to_origin(), adjoint(pose) @ points.to_origin() @ motions))[0]
 
 
 def span(columns: Array) -> Array:

@@ -4,6 +4,7 @@ import itertools
 import math
 from collections import deque
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -11,10 +12,10 @@ from torch import Tensor
 
 from ..core.checks import check_least
 from ..core.geometry import check_rigid
-from .ambiguity import UNKNOWN_VARIANCE
+from .ambiguity import UNKNOWN_VARIANCE, motions_of, unknown_motions
 from .follow import Followed, follow
 from .grids import DepthFrame, Grids, checked_grids, resolution_of, surface_of
-from .inverse import MOST_COST, SLOPE_NOISE, Points, Score, bare_points, refine, score_pose
+from .inverse import MOST_COST, SLOPE_NOISE, Points, Score, bare_points, center_and_units, points_of, refine, score_pose
 from .keyframe import Keyframe, make_keyframe
 from .result import Registration
 from .rigid import Array, distance_mm, inverted, orthonormal, rotation_vector
@@ -23,8 +24,9 @@ from .search import search_plane
 MOST_TURNS, MOST_AGAIN = 4, 16
 """Rotations with which shifts are searched again, and hypotheses that come of it, at most."""
 
-SAME_MM, MOST_TRIED = 0.4, 72
-"""Poses that move the contact to so nearly the same place are one, mm; and so many starts are tried for equal poses at most."""
+SAME_MM, MOST_TRIED, MOST_VAIN = 0.4, 72, 8
+"""Poses that move the contact to so nearly the same place are one, mm; and so many starts are tried for equal poses at most, and
+while none fits."""
 
 EQUAL, EQUAL_COST = 2.3, 0.008
 """Poses are equal whose costs on the fine grid are within so many times the least one, or so much more. A bolt head turned by 10
@@ -71,7 +73,8 @@ def register_depth(source: DepthFrame, target: DepthFrame, mm_per_pixel: float, 
     mm_per_pixel = check_least("mm_per_pixel", mm_per_pixel, 1e-6, 1e3)  # a nanometre, a metre
     moving, fixed = (surface_of(frame, name, with_skin=True) for frame, name in ((source, "source"), (target, "target")))
     keyframe = make_keyframe(moving, mm_per_pixel, "source")
-    frame = checked_grids(fixed, mm_per_pixel, resolution_of(fixed, mm_per_pixel, "target"), "target")
+    resolution = resolution_of(fixed, mm_per_pixel, "target")
+    frame = checked_grids(fixed, mm_per_pixel, resolution, "target")
     sizes = [tuple(surface.depth_mm.shape[-2:]) for surface in (moving, fixed)]
     if sizes[0] != sizes[1]:
         cause = "positions count from the image's middle, so a cropped frame lies elsewhere"
@@ -82,9 +85,16 @@ def register_depth(source: DepthFrame, target: DepthFrame, mm_per_pixel: float, 
     starts += likely_poses(keyframe, frame)
     if not starts:
         reason = "nothing fits: one of the contacts has no relief that could be compared"
-        unknown = torch.eye(6, dtype=torch.float64) * UNKNOWN_VARIANCE
-        return Registration(torch.eye(4, dtype=torch.float64), math.inf, 0.0, False, reason, unknown, [], [], 0.0)
-    return _registration(equal_poses(keyframe, frame, starts) or [follow(keyframe, frame, starts[:1])])
+        spread = torch.eye(6, dtype=torch.float64) * UNKNOWN_VARIANCE
+        return Registration(torch.eye(4, dtype=torch.float64), math.inf, 0.0, False, reason, spread, [], [], 0.0)
+    found = equal_poses(keyframe, frame, starts) or [follow(keyframe, frame, starts[:1])]
+    row, column = frame.coarse.pixels()
+    own = points_of(frame.coarse, row, column, *center_and_units(frame.coarse.points(row, column)))
+    unknown = unknown_motions(frame.coarse, own, resolution.noise)
+    if found[0].agrees and unknown.shape[1] > found[0].free.shape[1]:  # of real balls one frame in eight seems to show a rotation
+        held = motions_of(keyframe.many, unknown, own, inverted(found[0].pose))
+        found = equal_poses(replace(keyframe, held=held), frame, [one.pose for one in found]) or found
+    return _registration(found)
 
 
 def _registration(found: list[Followed]) -> Registration:
@@ -189,7 +199,7 @@ def equal_poses(
     def fits(one: Followed) -> bool:
         return one.free.shape[1] < 6 and one.score.is_enough(most_cost)
 
-    while waiting and len(tried) < MOST_TRIED:
+    while waiting and len(tried) < (MOST_TRIED if found else MOST_VAIN):
         start = waiting.popleft()
         if not is_new(start, tried):
             continue

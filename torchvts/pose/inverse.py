@@ -65,6 +65,12 @@ class Points(NamedTuple):
         """Of pixels."""
         return self.columns.shape[1]
 
+    def to_origin(self) -> Array:
+        """(6, 6), which turns a scaled twist into one about the origin, rad and mm."""
+        matrix = np.diag(self.units)
+        matrix[3:, :3] = cross(self.center) @ matrix[:3, :3]
+        return matrix
+
 
 class Sums(NamedTuple):
     """Sums over the reference's pixels under one pose.
@@ -322,8 +328,6 @@ def alignment_sums(channels: Tensor, columns: Tensor, limits: Array, score_only:
 
 def covariance_after(points: Points, pose: Array, scaled: Array) -> Array:
     """Covariance of a small motion after the pose, rad and mm, from that of a scaled twist before it."""
-    to_origin = np.diag(points.units)
-    to_origin[3:, :3] = cross(points.center) @ to_origin[:3, :3]
-    after = adjoint(pose) @ to_origin
+    after = adjoint(pose) @ points.to_origin()
     covariance: Array = after @ scaled @ after.T
     return covariance

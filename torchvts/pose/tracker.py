@@ -84,8 +84,8 @@ class PoseTracker:
     Each frame is aligned with a keyframe from the last pose: Gauss-Newton on slopes and heights of the pixels that touch in
     both, with derivatives computed once per keyframe. Motions that the contact does not determine keep their value and are named
     in ``ambiguous``. Where the contact has little in common with the reference any more, or what they have in common shows the pose
-    less well, frames become keyframes in turn; where an older keyframe is seen again, the loop is closed and the drift since is
-    spread over it. A pose that contradicts the frame is not returned: ``lost`` says why, and the next frames are searched as
+    less well, frames become keyframes in turn; where an older keyframe is seen again, the loop is closed and tracking goes on with
+    that. A pose that contradicts the frame is not returned: ``lost`` says why, and the next frames are searched as
     :func:`register_depth` does, until the object is found.
     Of a symmetric object it may then be found in another of its equal poses: from there on ``alternatives`` lists the others.
 
@@ -255,7 +255,8 @@ class PoseTracker:
         for index in dict.fromkeys(() if message else (0, self._active)):
             keyframe, chain = self.graph.keyframes[index], self.graph.poses[index]
             back, spread = inverted(chain), self.graph.keyframes[0].spread
-            starts = [*likely_poses(keyframe, frame), self._poses[-1] @ back]
+            starts = likely_poses(keyframe, frame)
+            starts.insert(1, self._poses[-1] @ back)
             motions = [chain @ motion @ back for motion in self._reference_symmetries()]
             equal = equal_poses(keyframe, frame, starts, motions, self._most_cost())
             problems = [self._problem(index, one, [one.pose @ chain]) for one in equal]

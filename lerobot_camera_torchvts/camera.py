@@ -66,7 +66,7 @@ class TactileCamera(Camera):
     def connect(self, warmup: bool = True) -> None:
         """Open the source, whose first frames must be without contact; ``warmup`` waits for the first depth."""
         stream = TactileStream(self.config.source, self.calibration, background_frames=self.config.background_frames, realtime=True)
-        logging.getLogger(__name__).info(stream.note)
+        logging.getLogger(__name__).info(str(stream.calibration))
         self._newest: tuple[float, dict[str, NDArray[Any]]] | None = None
         self._fresh = False
         self._ended: Exception | None = None

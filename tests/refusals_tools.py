@@ -115,11 +115,11 @@ TABLE = {
         {"reader": Frames([]), "path": "raw"}, {"reader": [], "path": ["raw.avi", None, 2.5]}, named={"path": "record"}, run=False),
     "stream.VideoFile": Entry(
         {"path": "film.avi", "fps": 10.0}, {"path": ["film.gif", "film"], "fps": NUMBER}, named={"path": "video"}),
-    "stream.calibrate_background": Entry(
-        {"background": image(), "sensor": sensor(), "presses": ()}, {"background": images(), "presses": [[image()], None]}),
     "stream.open_source": Entry({"source": ..., "reconnect_s": 0.0}, {
         "source": ["no/such.mp4", ".", None, 2.5, True, -1, 2**31, 10**400, "9" * 20, "\u00b2"],
         "reconnect_s": ["1", None, NAN, -1.0]}, run=False),
+    **dict.fromkeys(("frames", "stream.frames"), Entry(
+        {"source": ...}, {"source": ["no/such.mp4", ".", None, 2.5, True, -1, 2**31, 10**400, "9" * 20, "\u00b2"]}, run=False)),
     "stream.find_background": Entry(
         {"images": image()[None].expand(5, -1, -1, -1), "sensor": None, "codec": ""},
         {"images": [*batches(3), image()[None]], "sensor": [], "codec": []}

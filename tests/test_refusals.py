@@ -51,7 +51,7 @@ PARTS = {
     "stream.CameraSettings", "stream.Camera", "stream.Keys", "stream.LiveView", "stream.Sheet", "stream.StreamReport.",
     "stream.TactileStream.rezero", "stream.VideoFile.", "stream.find_camera", "stream.has_screen",
     "read_result", "stream.check_device", "stream.read_background", "stream.read_press_images", "stream.require_rerun",
-    "stream.use_calibration", "stream.with_background", "unit_pipeline", "unseen_deg", "usual_unseen_deg",
+    "stream.with_background", "unit_pipeline", "unseen_deg", "usual_unseen_deg",
     "StatedError", "StatedError.", "stated_deg", "stated_error_deg", "with_preprocessing", "write_point_cloud",
 }  # fmt: skip
 """Names, and with a dot at the end methods, that other tests cover: records, base classes, what one room does for another."""

@@ -15,7 +15,6 @@ from torchvts.calibration.doubts import of_type
 from torchvts.calibration.given_images import colour_share, colour_variation
 from torchvts.model.response_field import CHANGE_SCALE, ResponseField, ResponseModel, SensorPrior, fit_log_background
 from torchvts.model.summary import expected
-from torchvts.stream import use_calibration
 
 HEIGHT, WIDTH, PITCH = 90, 120, 0.15
 SENSOR = vts.Sensor("drawn", HEIGHT, WIDTH, PITCH, gamma=1.0, blur_px=1.0)
@@ -200,8 +199,8 @@ def test_a_prior_on_a_background_that_is_not_its_own_is_not_metric(tmp_path):
     other, _ = calibrate(camera(other_light()).flip(1, 2), sensor)
     other.save(tmp_path / "unit.safetensors")
     kept = vts.Calibration.load(tmp_path / "unit.safetensors")
-    assert own.report["not_metric"] == [] and use_calibration(own).metric
-    assert "turned by 180 degrees" in kept.report["not_metric"][0] and not use_calibration(kept).metric
+    assert own.report["not_metric"] == [] and own.metric
+    assert "turned by 180 degrees" in kept.report["not_metric"][0] and not kept.metric
     assert expected(kept).startswith("depth is NOT METRIC")
 
 

@@ -8,9 +8,9 @@ from torch import Tensor
 
 from ..core.checks import QUANTISATION_STD
 from ..core.geometry import pixel_grid_mm
+from ..core.levels import SATURATED
 from ..core.noise import noise_std
 from ..core.robust import TUKEY, tukey_weight
-from ..model.calibration import SATURATED
 from ..model.lights import PointLights, log_slope_of_lobe, microfacet
 from ..model.sensor import Sensor
 

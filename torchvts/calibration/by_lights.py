@@ -5,7 +5,7 @@ import dataclasses
 import torch
 from torch import Tensor
 
-from ..compensate.light import BLACK
+from ..core.levels import BLACK
 from ..model.calibration import Calibration
 from ..model.lights import PointLights, flat_image
 from ..model.report import Report

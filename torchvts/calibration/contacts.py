@@ -8,12 +8,13 @@ import torch
 from torch import Tensor
 
 from ..compensate import Compensate
-from ..compensate.light import BLACK, unevenness
+from ..compensate.light import unevenness
 from ..core.blur import band_of_ratios, without_margin
 from ..core.geometry import gradient_from_normal, pixel_grid_mm
+from ..core.levels import BLACK, MOST_SATURATED, SATURATED
 from ..core.morphology import dilate, erode
 from ..integration import PoissonBackground
-from ..model.calibration import PEDESTAL, SATURATED, Calibration
+from ..model.calibration import PEDESTAL, Calibration
 from ..model.report import PressRow
 from ..model.response_field import ResponseField, ResponseModel
 from ..model.sensor import Sensor
@@ -29,12 +30,6 @@ LEAST_INSIDE = 10
 
 ROUGH = 0.13
 """Structure between the channels of a background from which it is taken for a contact: :func:`channel_structure`."""
-
-DARK = 0.25
-"""An image of less light than this part of the background's is no press: 12 bits in a file of 16 give 1/16."""
-
-MOST_SATURATED = 0.5
-"""A contact with more of it saturated in some channel is left out."""
 
 DIFFERS = 4.5
 """Change in units of the noise from which an image differs."""
@@ -153,7 +148,7 @@ def read_contacts(given: Sequence[Press], background: Tensor, sensor: Sensor) ->
         saturated = ((item.image > SATURATED) & (background < SATURATED)).any(dim=0).cpu()
         contact = _sampled(item, change.double(), region, saturated, sensor)
         contact.uneven = float(unevenness(compensate.light_of(item.image.detach().cpu().float()[None])).max())
-        contact.reason = _unusable(item.image, background, differs, spread) or _saturated(float(saturated[region].double().mean()))
+        contact.reason = _no_press(differs, spread) or _saturated(float(saturated[region].double().mean()))
         if item.center_px is not None:
             _place(contact, item, sensor)
         contacts.append(contact)
@@ -192,13 +187,9 @@ def _place(contact: Contact, press: Press, sensor: Sensor) -> None:
     contact.contact_radius_mm = min(radius_px * sensor.mm_per_pixel, 0.9 * contact.radius_mm)
 
 
-def _unusable(image: Tensor, background: Tensor, differs: Tensor, spread: float) -> str:
-    """Why an image cannot be used, or "". ``differs``: (H, W), where it differs from the background."""
+def _no_press(differs: Tensor, spread: float) -> str:
+    """Why an image shows no press, or "". ``differs``: (H, W), where it differs from the background."""
     share = float(differs.double().mean())
-    level = float(image.double().mean() / background.double().mean())
-    if level < DARK:
-        depth = "black" if level < 1e-3 else f"{1 / level:.0f} times darker than the background"
-        return f"the image is {depth}: a dropped frame, or 12 bits in a file of 16?"
     border = torch.cat((differs[0], differs[-1], differs[:, 0], differs[:, -1])).double().mean()
     if share < 0.002:
         return (

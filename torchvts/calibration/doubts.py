@@ -11,8 +11,9 @@ from torch import Tensor
 
 from ..compensate.light import UNEVEN
 from ..core.arrays import array_of
+from ..core.levels import SATURATED
 from ..core.views import Views
-from ..model.calibration import SATURATED, Calibration
+from ..model.calibration import Calibration
 from ..model.report import NOT_CHECKED, Report
 from ..model.response_field import ResponseField
 from ..model.sensor import Sensor

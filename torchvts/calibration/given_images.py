@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 
 from ..core.arrays import array_of
-from ..core.views import TWELVE_BITS, Views
-from ..model.calibration import PEDESTAL, SATURATED
-from .contacts import DARK, MOST_SATURATED
+from ..core.levels import DARK, DARKEST, MOST_SATURATED, SATURATED, bits_of
+from ..model.calibration import PEDESTAL
+from ..model.usable import FrameCheck
 from .presses import Press
 
 UNIFORM_COLOUR = 0.05
@@ -35,11 +35,11 @@ def check_exposure(background: Tensor) -> None:
     """
     for name, channel in zip("RGB", background.detach(), strict=True):
         mean, saturated = float(channel.mean()), float((channel > SATURATED).double().mean())
-        if mean < 0.02:
+        if mean < DARKEST:
             raise ValueError(
                 f"background: expected light in channel {name}, got a mean of {mean:.4f}: black image, LED or exposure off"
             )
-        if saturated > 0.5:
+        if saturated > MOST_SATURATED:
             raise ValueError(
                 f"background: expected light below the camera's limit, got a channel {name} that is saturated "
                 f"in {saturated:.0%} of the image: lower the exposure"
@@ -49,11 +49,8 @@ def check_exposure(background: Tensor) -> None:
                 f"background: expected light that varies, got a channel {name} that is constant at {mean:.4f}: "
                 "not a camera image of a lit skin"
             )
-    most = float(background.max())
-    if most <= TWELVE_BITS + 1e-6:
-        raise ValueError(
-            f"background: expected values up to 1, got at most {round(65535 * most)} of 65535: 12 bits stored in 16, or black?"
-        )
+    if bits := bits_of(float(background.max())):
+        raise ValueError(f"background: expected values up to 1: {bits}")
 
 
 def check_light(background: Tensor, presses: Sequence[Press]) -> None:
@@ -133,35 +130,34 @@ class Sorted(NamedTuple):
 
 
 def sort_presses(background: Tensor, presses: Sequence[Press]) -> Sorted:
-    """Presses that show the background's view of the skin. A few that do not are left out; if they are half of all, none is used.
+    """Presses that can be held against the background. A few that cannot are left out; if they are half of all, none is used.
 
     Args:
         background: (3, H, W) in [0, 1].
         presses: checked, with names.
     Raises:
-        ValueError: presses that are saturated, much darker than the background, turned, mirrored, cropped or swapped otherwise, or
-            of another unit; a background much darker than the presses.
+        ValueError: presses with a flaw (:class:`torchvts.model.usable.FrameCheck`), or of another unit; a background much darker
+            than the presses.
     """
     if not presses:
         return Sorted([], [])
-    _check_levels(background, presses)
-    views = Views(array_of(background))
-    cells = [views.cells(array_of(press.image)) for press in presses]
-    found = [views.other(one) for one in cells]
-    odd = [(k, view) for k, view in enumerate(found) if view is not None]
-    refused = odd[0] if 2 * len(odd) >= len(presses) else None
-    differences = [views.difference(one) for one in cells]
-    if refused is not None:
+    check = FrameCheck(background.detach())
+    flaws = [check.flaw(press.image[None]) for press in presses]
+    _check_darkness(background, [press.image for press, flaw in zip(presses, flaws) if flaw is None or flaw.name != "overexposed"])
+    odd = [(k, flaw) for k, flaw in enumerate(flaws) if flaw is not None]
+    if 2 * len(odd) >= len(presses):
+        k, flaw = odd[0]
         raise ValueError(
-            f"presses: expected the background's view of the skin, got {len(odd)} of {len(presses)} that show another: "
-            f"{presses[refused[0]].name} {refused[1].in_words()}: read and turn the presses as the background, or take them again"
+            f"presses: expected the background's view of the skin in its light, got {len(odd)} of {len(presses)} that are none: "
+            f"{presses[k].name} {flaw.text}: take, read and turn the presses as the background"
         )
-    if (difference := statistics.median(differences)) > OTHER_UNIT:
+    difference = statistics.median(check.views.difference(check.views.cells(array_of(press.image))) for press in presses)
+    if difference > OTHER_UNIT:
         raise ValueError(
             f"presses: expected the light of the background, got images that differ from it by {difference:.0%} in the median of "
             f"the skin, at most {OTHER_UNIT:.0%} is usual: another unit, another light, or another crop"
         )
-    reasons = {k: f"it {view.in_words()}" for k, view in odd}
+    reasons = {k: f"it {flaw.text}" for k, flaw in odd}
     for k in range(len(presses)):
         if k not in reasons and (first := _first_like(presses, k)) != k:
             reasons[k] = f"it is {presses[first].name} once more"
@@ -169,32 +165,20 @@ def sort_presses(background: Tensor, presses: Sequence[Press]) -> Sorted:
     return Sorted(kept, sorted(reasons.items()))
 
 
+def _check_darkness(background: Tensor, presses: Sequence[Tensor]) -> None:
+    """Raise if the background is much darker than presses, in their median."""
+    level = statistics.median(float(image.double().mean()) for image in presses) if presses else 0.0
+    share = float(background.double().mean()) / max(level, 1e-9)
+    if share < DARK:
+        cause = bits_of(float(background.max())) or "black, or the LEDs were off"
+        raise ValueError(f"background: expected a brightness like that of the presses, got {share:.0%} of it: {cause}")
+
+
 def _first_like(presses: Sequence[Press], k: int) -> int:
     """Index of the first press with the image and the diameter of the k-th."""
     wanted = presses[k]
     alike = (i for i, press in enumerate(presses) if press.ball_diameter_mm == wanted.ball_diameter_mm)
     return next(i for i in alike if torch.equal(presses[i].image, wanted.image))
-
-
-def _check_levels(background: Tensor, presses: Sequence[Press]) -> None:
-    """Raise if the presses, in the median, are saturated, or much darker than the background, or it than they."""
-    saturated = statistics.median(float((press.image > SATURATED).double().mean()) for press in presses)
-    if saturated > MOST_SATURATED:
-        raise ValueError(
-            f"presses: expected light below the camera's limit, got images of which {saturated:.0%} is saturated in the median: "
-            "lower the exposure"
-        )
-    level = statistics.median(float(press.image.double().mean()) for press in presses) / float(background.double().mean())
-    for name, other, ratio, images in (
-        ("presses", "the background's", level, [press.image for press in presses]),
-        ("background", "that of the presses", 1.0 / max(level, 1e-9), [background]),
-    ):
-        if ratio < DARK:
-            most = max(float(image.max()) for image in images)
-            twelve = 0.01 < most <= TWELVE_BITS + 1e-6
-            bits = f"its largest value is {round(65535 * most)} of 65535: 12 bits stored in 16?"
-            cause = bits if twelve else "black, or the LEDs were off"
-            raise ValueError(f"{name}: expected a brightness like {other}, got {ratio:.0%} of it: {cause}")
 
 
 def _cells(image: Tensor, rows: int) -> Tensor:

@@ -8,9 +8,10 @@ from torch import Tensor
 
 from ..core.blur import band_of_ratios, blur, gaussian_weights
 from ..core.geometry import pixel_grid_mm
+from ..core.levels import SATURATED
 from ..core.morphology import dilate
 from ..core.robust import TUKEY, tukey_weight
-from ..model.calibration import PEDESTAL, SATURATED, Calibration
+from ..model.calibration import PEDESTAL, Calibration
 from ..model.response_field import position_basis
 from .presses import Press
 from .touching import depth_of

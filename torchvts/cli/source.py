@@ -73,7 +73,7 @@ def open_stream(arguments: argparse.Namespace, unit: Sensor | Calibration, press
     note = f"the first {first} are without contact" if first else "the calibration's background is used as it is"
     assumed = " are assumed, without times.csv" if isinstance(stream.reader, FileReader) and stream.reader.fps_assumed else ""
     print(f"{stream.reader.name}: {stream.fps:g} frames a second{assumed}; {note}")
-    print(f"{stream.note}\nready after {time.perf_counter() - started:.1f} s")
+    print(f"{stream.calibration}\nready after {time.perf_counter() - started:.1f} s")
     return stream
 
 

@@ -25,12 +25,11 @@ from ..stream import (
     TactileFrame,
     TactileStream,
     VideoFile,
-    calibrate_background,
     read_background,
     read_press_images,
 )
 from ..viz import save_figure
-from .options import add_press
+from .options import add_press, calibrated
 from .parser import UsageError
 from .source import add_source, add_video, load_unit, open_stream, play
 
@@ -68,9 +67,7 @@ def run(arguments: argparse.Namespace) -> int:
     if isinstance(unit, Sensor):
         presses = read_press_images(arguments.press, unit)
     if isinstance(unit, Sensor) and arguments.background:
-        found = calibrate_background(read_background(arguments.background, unit, arguments.background_frames), unit, presses)
-        print(found.note)
-        unit, presses = found.calibration, ()
+        unit, presses = calibrated(read_background(arguments.background, unit, arguments.background_frames), unit, presses), ()
     with contextlib.ExitStack() as stack:
         stream = stack.enter_context(open_stream(arguments, unit, presses))
         if arguments.save_calibration is not None:

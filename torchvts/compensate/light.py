@@ -6,6 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from ..core.checks import check_field, check_positive, check_same_size, check_shape
+from ..core.levels import BLACK
 from ..core.precision import widened
 from ..model.calibration import PEDESTAL, Calibration, check_calibration
 
@@ -36,9 +37,6 @@ most down to the noise of real frames. Samples off by twice that, in each channe
 
 UNEVEN = 0.06
 """Unevenness of the light's change that presses make at most."""
-
-BLACK = 2.0 / 255.0
-"""Image value up to which a sample is black: it says nothing of the light."""
 
 LEAST_LIGHT = 0.05
 """Least light, over the background's, that is divided by: where a surface is extrapolated it may be anything."""

@@ -53,7 +53,8 @@ def raw_frames(source: str | Path) -> Iterator[RawFrame]:
     if path.is_dir():
         files = image_files(path)
         if not files:
-            raise ValueError(f"{path}: no images in this folder ({', '.join(IMAGE_SUFFIXES)})")
+            known = ", ".join(IMAGE_SUFFIXES)
+            raise ValueError(f"source: expected a folder of images ({known}), got {path}: no images in this folder")
         return (frame for file in files for frame in _of_file(file))
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file or folder")

@@ -13,9 +13,6 @@ from .arrays import Array, cell_means, lower_median
 CROPS = (0.1, 1.0 / 7.0, 0.2)
 """Shares of each side that one image may show beyond the other: raw frames of a GelSight Mini are cut by a seventh."""
 
-TWELVE_BITS = 4095.0 / 65535.0
-"""Largest value of 12 bits stored in 16."""
-
 PEDESTAL = 0.01
 """Added to image values before the logarithm: dark cells are noise."""
 
@@ -53,6 +50,13 @@ class OtherView(NamedTuple):
     def cropped(self) -> bool:
         """Whether the image shows more or less of the skin."""
         return "cropped" in self.what
+
+    @property
+    def name(self) -> str:
+        """One word: "swapped", "turned", "shows_more" or "shows_less"."""
+        if self.cropped:
+            return "shows_more" if "shows more" in self.what else "shows_less"
+        return "swapped" if "swapped" in self.what else "turned"
 
     def in_words(self) -> str:
         """Such as "is turned by 180 degrees (2% off the background with that undone, 31% as it is)"."""

@@ -9,10 +9,11 @@ import torch
 
 from ..calibration import ROUGH, channel_structure
 from ..core.frame import Conditions
+from ..core.levels import SATURATED
 from ..model.stated_error import stated_deg, stated_error_deg
 from ..model.summary import SATURATED_SHARE
+from ..model.usable import FrameCheck
 from ..pipeline import UNEVEN, UNSEEN_DEG, DepthPipeline, light_levels, light_unevenness
-from ..stream import FrameCheck
 from .camera import blockiness, levels_of, new_spots, pattern_likeness, texture_share
 from .examination import MISFITS, Examination
 from .findings import FAULT_DEG, WARNING_DEG, Finding, by_cost
@@ -38,6 +39,13 @@ a JPEG of quality 95 has 1.2 to 1.3."""
 
 COPLANAR = 0.3
 """Smallest singular value of the lights' directions below which they nearly lie in one plane."""
+
+FINDINGS = {
+    "swapped": ("channels_swapped", "; read the image in the order R, G, B"),
+    "turned": ("other_view", "; take both in the same way"),
+    "shows_less": ("other_view", "; take both in the same way"),
+}
+"""The finding of a flaw of the view (:class:`torchvts.model.usable.Flaw`), and what to do."""
 
 Figures = dict[str, Any]
 """What a check measured: ``value`` is compared with its limit, all of it may stand in its message."""
@@ -95,7 +103,7 @@ def run_checks(examination: Examination) -> Iterator[Finding]:
 
 
 def _clipped_at_calibration(e: Examination) -> float:
-    return float((e.value > 0.99).any(0).double().mean())
+    return float((e.value > SATURATED).any(0).double().mean())
 
 
 def _contact_at_calibration(e: Examination) -> float | None:
@@ -164,13 +172,11 @@ def _noise(e: Examination) -> Figures | None:
 
 
 def _unusable(e: Examination) -> Finding | None:
-    view = e.check.other_view(e.raw[None])
-    text = "" if "shows more" in view else e.check(e.raw[None])  # a contact over all of the skin looks so, too
-    if not text:
+    flaw = e.check.flaw(e.raw[None])
+    if flaw is None or flaw.name == "shows_more":  # a contact over all of the skin looks so, too
         return None
-    if "swapped" in view:
-        return Finding("channels_swapped", f"{view}; read the image in the order R, G, B", "fault", 1.0)
-    return Finding("other_view" if view else "no_picture", f"{text}{'; take both in the same way' if view else ''}", "fault", 1.0)
+    name, remedy = FINDINGS.get(flaw.name, ("no_picture", ""))
+    return Finding(name, f"the frame {flaw.text}{remedy}", "fault", 1.0)
 
 
 def _failed(e: Examination) -> Figures:
@@ -180,7 +186,7 @@ def _failed(e: Examination) -> Figures:
 
 
 def _saturated(e: Examination) -> Figures | None:
-    clipped = (e.raw > 0.99).any(0)
+    clipped = (e.raw > SATURATED).any(0)
     inside = float(clipped[e.moved].double().mean()) if bool(e.moved.any()) else 0.0
     anywhere = float(clipped.double().mean())
     where = f"{inside:.0%} of the contact" if inside > anywhere else f"{anywhere:.0%} of the image"
@@ -209,8 +215,9 @@ def _light_at_calibration(e: Examination) -> Figures | Finding | None:
     if light is None:
         return None
     view = FrameCheck(e.value_of(e.unit.model_image)).other_view(e.value[None])
-    if "swapped" in view:
-        return Finding("channels_swapped", f"already at calibration: {view}; read images in the order R, G, B", "fault", 1.0)
+    if view is not None and view.name == "swapped":
+        text = f"already at calibration the image {view.text}; read images in the order R, G, B"
+        return Finding("channels_swapped", text, "fault", 1.0)
     return light
 
 

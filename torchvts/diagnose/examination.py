@@ -12,12 +12,13 @@ from ..core.cells import whole_cell_means
 from ..core.checks import QUANTISATION_STD
 from ..core.frame import Conditions, DepthOutput, Frame
 from ..core.geometry import angles_deg, lengths, normal_from_gradient
+from ..core.levels import BRIGHT, DARKEST, LIT
 from ..core.noise import noise_std
 from ..model import Calibration
 from ..model.lights import inverse_light_matrix
+from ..model.usable import FrameCheck
 from ..pipeline import DepthPipeline, usual_unseen_deg
 from ..skin.weight import spread_of
-from ..stream import FrameCheck
 from .camera import levels_of
 
 TILTED_DEG = 3.0
@@ -103,7 +104,7 @@ class Examination:
     @cached_property
     def free(self) -> Tensor:
         """(H, W) bool, skin on which the pipeline sees no movement, neither dark nor clipped."""
-        usable = (self.image > 0.02).all(0) & (self.image < 0.98).all(0)
+        usable = (self.image > DARKEST).all(0) & (self.image < BRIGHT).all(0)
         return (self.frame.weight[0, 0] <= 0.0) & usable
 
     @cached_property
@@ -155,7 +156,7 @@ class Examination:
     def failed(self) -> list[int]:
         """Channels that are black everywhere and were not at calibration."""
         level, background = self.image.flatten(1).quantile(0.99, dim=1), self.value.flatten(1).median(dim=1).values
-        return [j for j in range(3) if level[j] < max(0.02, 4.0 * float(self.noise[j])) and background[j] > 0.06]
+        return [j for j in range(3) if level[j] < max(DARKEST, 4.0 * float(self.noise[j])) and background[j] > LIT]
 
     # ---- the light ----
 
@@ -230,6 +231,6 @@ class Examination:
         share = ((normal / length)[:, None] * inverse).sum(0)  # derivative of the length by each channel
         ratio = (self.noise / unit.noise_std.float()).clamp_min(1.0).reshape(3, 1, 1)
         noise = lengths(share * unit.compensated_noise_std * ratio, 0)
-        usable = ~self.dark.any(0) & (self.raw < 0.98).all(0) & (self.raw == self.image).all(0)
+        usable = ~self.dark.any(0) & (self.raw < BRIGHT).all(0) & (self.raw == self.image).all(0)
         inside = usable & self.moved if bool(self.moved.any()) else usable
         return ((length - 1.0) / noise)[inside] if int(inside.sum()) >= 20 else None

@@ -24,6 +24,7 @@ from ..core.checks import (
     check_tensor,
 )
 from ..core.files import image_from_bytes, image_to_bytes, load_tensors, save_tensors
+from ..core.levels import SATURATED
 from ..core.noise import noise_std
 from .lights import PointLights, flat_image, inverse_light_matrix
 from .markers import FillMarkers, is_printed
@@ -45,9 +46,6 @@ PEDESTAL = 0.03
 
 UNKNOWN_NOISE = 0.003
 """Noise in image value, three quarters of a grey level, of a camera of which there is no image."""
-
-SATURATED = 0.995
-"""Image value from which a channel is saturated."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,6 @@ import torch
 from torch import Tensor, nn
 
 from ..compensate import Compensate
-from ..compensate.light import BLACK
 from ..core.blur import MOST_BLUR_PX, blur, gaussian_weights
 from ..core.cells import cells_to_pixels, whole_cell_means
 from ..core.checks import (
@@ -27,9 +26,10 @@ from ..core.checks import (
     check_switch,
 )
 from ..core.geometry import GradientFromNormal
+from ..core.levels import BLACK, SATURATED
 from ..core.noise import noise_std as frame_noise_std
 from ..integration import PoissonBackground
-from ..model.calibration import PEDESTAL, SATURATED, Calibration, check_calibration
+from ..model.calibration import PEDESTAL, Calibration, check_calibration
 from ..model.response_field import CHANGE_SCALE, MAX_SLOPE
 from ..model.stated_error import StatedError
 from ..normals import NormalFromIntensity, NormalFromResponse, as_normal_model

@@ -1,13 +1,12 @@
 """Depth of cameras, videos and folders of images, frame by frame; late frames are dropped."""
 
+from ..model.usable import FrameCheck
 from . import messages
 from .background import (
     FIRST_FRAMES,
-    calibrate_background,
     find_background,
     read_background,
     read_press_images,
-    use_calibration,
     with_background,
 )
 from .cameras import Camera, CameraSettings
@@ -21,7 +20,6 @@ from .record import Recorder
 from .recording import Recording, check_device
 from .sources import Reader, Unreadable, frames, open_source
 from .stages import StageClock
-from .usable import FrameCheck
 from .video import VideoFile
 from .view import LiveView, has_screen, require_rerun
 
@@ -44,7 +42,6 @@ __all__ = [
     "TactileStream",
     "Unreadable",
     "VideoFile",
-    "calibrate_background",
     "check_device",
     "find_background",
     "find_camera",
@@ -55,6 +52,5 @@ __all__ = [
     "read_background",
     "read_press_images",
     "require_rerun",
-    "use_calibration",
     "with_background",
 ]

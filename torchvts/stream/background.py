@@ -1,21 +1,17 @@
-"""The background of a unit: found in the first frames of a stream, calibrated from, and replaced where a stream is zeroed again."""
+"""The background of a unit: found in the first frames of a stream, and replaced where a stream is zeroed again."""
 
 import dataclasses
 import math
-import warnings
 from collections.abc import Sequence
 from itertools import islice
 from pathlib import Path
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from ..calibration import (
     ROUGH,
-    CalibrationWarning,
     Press,
-    calibrate,
     channel_structure,
 )
 from ..core.blur import band_of_ratios, without_margin
@@ -24,7 +20,6 @@ from ..core.checks import check_batch, check_image, check_integer, check_path, c
 from ..core.recordings import is_film, video_codec
 from ..model import Calibration, Sensor, SensorPrior, check_calibration, check_sensor
 from ..model.calibration import PEDESTAL
-from ..model.summary import NOT_METRIC
 from ..normals import NormalFromResponse
 from .sources import frames
 
@@ -215,48 +210,6 @@ def _check_steady(images: Tensor, codec: str) -> None:
             "--background-frames 0; background_frames=0)"
         )
     raise ValueError(f"{where}: a contact, or the sensor moves; start without contact, or take fewer frames")
-
-
-class StreamCalibration(NamedTuple):
-    """The calibration of a stream.
-
-    Attributes:
-        calibration: of the unit.
-        note: where it comes from and what to expect of it, in words.
-        metric: whether depth is in mm, as far as is known.
-    """
-
-    calibration: Calibration
-    note: str
-    metric: bool
-
-
-def calibrate_background(background: Tensor, sensor: Sensor, presses: Sequence[Press] = ()) -> StreamCalibration:
-    """:func:`calibrate`, with its warnings as a note.
-
-    Args:
-        background: (3, H, W) in [0, 1].
-        sensor: what the image is of.
-        presses: of balls.
-    """
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        calibration = calibrate(background, sensor, presses)
-    notes = [str(w.message) for w in caught if issubclass(w.category, CalibrationWarning)]
-    return _described(calibration, "; ".join([str(calibration.report["reason"]), *notes]))
-
-
-def use_calibration(calibration: Calibration) -> StreamCalibration:
-    """A calibration that was given, as that of a stream."""
-    report = calibration.report
-    return _described(calibration, f"calibration given: {report.get('reason', report.get('model', 'lights'))}")
-
-
-def _described(calibration: Calibration, note: str) -> StreamCalibration:
-    """With why depth is not metric, which the calibration itself says."""
-    if doubts := calibration.report.get("not_metric", []):
-        note = "; ".join([note, *(doubt for doubt in doubts if doubt not in note), NOT_METRIC])
-    return StreamCalibration(calibration, note, calibration.metric)
 
 
 def with_background(calibration: Calibration, background: Tensor) -> Calibration:

@@ -24,7 +24,7 @@ def summary_of(stream: TactileStream, frames: int) -> dict[str, Any]:
         "metric": stream.metric,
         "doubts": list(stream.calibration.report.get("doubts", [])),
         "mm_per_pixel": stream.calibration.sensor.mm_per_pixel,
-        "calibration_note": stream.note,
+        "calibration_note": stream.calibration.report.get("reason", ""),
     }
 
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ..calibration import Press
+from ..calibration import CalibrationWarning, Press, calibrate
 from ..core.checks import check_choice, check_integer, check_least, check_record, check_switch
 from ..core.files import rgb_from_bgr
 from ..core.recordings import Pixels
@@ -18,10 +18,7 @@ from ..pipeline import MODES, Conditions, DepthOutput
 from ..skin import ContactSettings
 from .background import (
     FIRST_FRAMES,
-    StreamCalibration,
-    calibrate_background,
     find_background,
-    use_calibration,
     with_background,
 )
 from .numbered import SourceFrames
@@ -58,9 +55,10 @@ class TactileStream:
     """Depth of every frame of a camera, a video or a folder of images.
 
     The first frames must be without contact (:func:`find_background`). Without a calibration the unit is calibrated from them
-    (:func:`calibrate_background`); with one they are compared with its background. Then each frame is rectified and goes the way
-    of :class:`Recording`, which data sets share. Of cameras, and of recordings with ``realtime``, only the newest frame is taken
-    and late ones are dropped; of other recordings all are. A frame that cannot be used (:class:`FrameCheck`) is left out.
+    (:func:`torchvts.calibrate`), and ``print(stream.calibration)`` says what speaks against it; with one they are compared with its
+    background. Then each frame is rectified and goes the way of :class:`Recording`, which data sets share. Of cameras, and of
+    recordings with ``realtime``, only the newest frame is taken and late ones are dropped; of other recordings all are. A frame
+    that cannot be used (:class:`FrameCheck`) is left out.
 
     Args:
         source: a camera (:func:`find_camera`), a network camera's URL, a video file, a folder of images, or a :class:`Reader`.
@@ -76,8 +74,6 @@ class TactileStream:
         record: where the raw frames of a camera are written, see :class:`Recorder`; None for nowhere.
     Attributes:
         calibration: of the unit.
-        note: where the calibration comes from and what to expect of it, in words.
-        metric: whether depth is in mm, as far as is known.
         dropped: number of frames that nobody took.
         left_out: (number, reason) of the frames that could not be used.
         stages: :class:`StageClock`.
@@ -123,7 +119,7 @@ class TactileStream:
             self._sensor, self._size = sensor, self._frames.readable[0].shape[:2]
             first = torch.cat([self._rectified(pixels) for pixels in self._frames.readable])
             self._codec: str = getattr(self.reader, "codec", "")
-            self.calibration, self.note, self.metric = _calibrated(first, sensor_or_calibration, presses, self._codec)
+            self.calibration = _calibrated(first, sensor_or_calibration, presses, self._codec)
             self._start = partial(
                 Recording,
                 mode=mode,
@@ -177,6 +173,11 @@ class TactileStream:
             warnings.warn(f"re-zero refused, the background stays: {error}", stacklevel=3)
         else:
             self.calibration = calibration
+
+    @property
+    def metric(self) -> bool:
+        """Whether depth is in mm, as far as is known."""
+        return self.calibration.metric
 
     @property
     def conditions(self) -> Conditions | None:
@@ -250,11 +251,14 @@ def _sensor_of(unit: Sensor | Calibration, background_frames: int, presses: Sequ
     return unit.sensor
 
 
-def _calibrated(first: Tensor, unit: Sensor | Calibration, presses: Sequence[Press], codec: str) -> StreamCalibration:
-    """The calibration that was given, or that of the first frames."""
+def _calibrated(first: Tensor, unit: Sensor | Calibration, presses: Sequence[Press], codec: str) -> Calibration:
+    """The calibration that was given, or that of the first frames, whose doubts it holds itself."""
     if isinstance(unit, Calibration):
-        return use_calibration(unit)
-    return calibrate_background(find_background(first, unit, codec).clamp(0.0, 1.0), unit, presses)
+        return unit
+    background = find_background(first, unit, codec).clamp(0.0, 1.0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", CalibrationWarning)
+        return calibrate(background, unit, presses)
 
 
 def _reader_of(source: str | int | Path | Reader, reconnect_s: float, record: str | Path | None) -> Reader:

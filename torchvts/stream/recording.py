@@ -12,10 +12,10 @@ from torch import Tensor
 from ..core.cells import whole_cell_means
 from ..core.spelling import suggest
 from ..model import Calibration, check_calibration
+from ..model.usable import FrameCheck
 from ..pipeline import Conditions, DepthOutput, DepthPipeline, FrozenPipeline, doubts_of, unit_pipeline, usual_unseen_deg
 from ..skin import ContactMask, ContactSettings
 from .background import find_background
-from .usable import FrameCheck
 
 
 def check_device(device: str) -> torch.device:

@@ -276,7 +276,7 @@ class FileReader:
             frames = raw_frames(path)
             first = next(frames)
         except ValueError as error:
-            raise ValueError(f"source: {error}") from error
+            raise ValueError(f"source: {str(error).removeprefix('source: ')}") from error
         self._frames: Iterator[RawFrame] = chain((first,), frames)
         names = [file.stem for file in image_files(path)] if path.is_dir() else list(known)
         self.times = [known[name] for name in names] if all(name in known for name in names) else []

@@ -60,8 +60,9 @@ def contact_cloud(frame: DepthFrame, mm_per_pixel: float, most: int | None = 100
     normals = torch.stack((-gradient[0], gradient[1], torch.ones_like(depth)), dim=-1)[inside].double()
     normals = torch.nn.functional.normalize(normals, dim=1)
     if most is not None and len(points) > check_integer("most", most, 1):
-        row, column = (place.double() for place in torch.nonzero(inside, as_tuple=True))
-        index = ((SPREAD[0] * row + SPREAD[1] * column) % 1.0).argsort(stable=True)[:most].sort().values
+        row, column = (at.double() for at in torch.nonzero(inside, as_tuple=True))
+        place = (SPREAD[0] * row + SPREAD[1] * column) % 1.0 * normals[:, 2]  # by the area of the skin: more on steep flanks
+        index = place.argsort(stable=True)[:most].sort().values
         points, normals = points[index], normals[index]
     return points, normals
 

@@ -28,6 +28,9 @@ MOST_RMSE = 0.3
 neighbours in any pose. Contacts fitted in the right pose have 0.02 to 0.15, knurls that are thinned up to 0.36, which are refused;
 wrong poses 0.48 to 1.8."""
 
+ALIKE_POINTS = 100
+"""Distances along the normal are alike over wide areas: however many points there are, they say as much as so many."""
+
 LEAST_INFORMATION = 1e-3
 """Mean squared share of a motion of 1 mm along the normals, below which the motion is called unknown."""
 
@@ -173,5 +176,5 @@ def _determined(points: Array, normal: Array, rmse_mm: float) -> tuple[list[str]
     jacobian = np.hstack((np.cross(middle, normal), normal)) * units
     free, shifts = free_directions(jacobian.T @ jacobian / len(jacobian), np.zeros((6, 6)), LEAST_INFORMATION)
     about_origin = np.hstack((np.cross(points, normal), normal))
-    known = about_origin.T @ about_origin / max(rmse_mm, 1e-6) ** 2
+    known = about_origin.T @ about_origin * (min(1.0, ALIKE_POINTS / len(points)) / max(rmse_mm, 1e-6) ** 2)
     return name_directions(free, shifts), torch.from_numpy(np.linalg.inv(known + np.diag([1.0] * 3 + [0.01] * 3)))

@@ -252,7 +252,7 @@ def test_nothing_changes_a_frozen_pipeline(unit):
 SETTINGS = {
     "mask.sigmas": 12.0, "mask.rise": (2.0, 5.0), "mask.cells": 40, "mask.grey_share": 0.6, "mask.failed": 0.2,
     "mask.least_spread": 0.02, "mask.weights": [0.25, 0.5, 0.25], "mask.by_colour": False,
-    "solve.zero.cells": 20, "solve.zero.waves": 5, "solve.zero.scales": [0.3, 0.2], "solve.zero.decay_mm": 0.7,
+    "solve.zero.cells": 20, "solve.zero.waves": 5, "solve.zero.face": 0.4, "solve.zero.decay_mm": 0.7,
     "solve.zero.smooth_mm": 0.8, "solve.zero.stiff": 3.0, "solve.zero.pit": 0.0, "solve.zero.pit_share": 0.2,
     "contact.share": 0.6, "contact.large": 0.5, "contact.deep": 0.5, "contact.rim_mm": 1.0,
     "contact.fall": 0.2, "contact.pull": 0.01, "contact.pulling": 0.2, "contact.least_depth": 0.3, "contact.cell": 3,

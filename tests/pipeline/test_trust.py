@@ -133,10 +133,10 @@ def test_a_pipeline_goes_through_safetensors(mode: str, tmp_path: Path) -> None:
         assert torch.equal(other(image).depth_mm, pipe(image).depth_mm)
 
 
-def test_a_state_of_other_scales_of_the_zero_is_refused() -> None:
+def test_a_state_of_another_zero_is_refused() -> None:
     pipe, other = (vts.DepthPipeline.from_calibration(rig()) for _ in range(2))
-    other.solve.zero.scales = [2.0 * scale for scale in other.solve.zero.scales]
-    with pytest.raises((ValueError, RuntimeError), match=r"zero\.scales"):
+    other.solve.zero.face *= 2.0
+    with pytest.raises((ValueError, RuntimeError), match=r"zero\.face"):
         pipe.load_state_dict(other.state_dict())
 
 

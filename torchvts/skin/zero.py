@@ -25,8 +25,8 @@ SMOOTH_MM = 0.35
 STIFF = 30.0
 """How much stiffer the deepest skin is against the offset: slopes are calibrated in contacts, and least known around them."""
 
-SCALES = (0.25, 0.1, 0.05)
-"""Depth, as a share of the frame's range, beyond which unchanged skin is a face of the object; one round of the fit each."""
+FACE = 0.25
+"""Depth, as a share of the frame's range, about which unchanged skin becomes a face of the object."""
 
 PIT = 2.0
 """Weight of depth below zero in moved skin: skin is pressed in and never pulled out."""
@@ -40,15 +40,15 @@ class ZeroBackground(nn.Module):
 
     A stretched skin on a soft gel bears the pressure p = z - L^2 laplace z. Free skin bears none; so an offset, a sum of a few
     cosines, is found that makes p vanish where the weight is 0, by weighted least squares. The law takes free skin on
-    beyond what can be seen, as it decays. Unchanged skin that stays deep lies on a face of the object and lets go, round by round.
+    beyond what can be seen, as it decays. Unchanged skin that is deep lies on a face of the object and counts less.
     The offset is smooth, most of all where skin is deep, so that errors of slopes go into the free skin. Without any free skin, the
     lowest cell is at zero. Differentiable.
 
     Args:
         mm_per_pixel: pixel pitch, mm.
     Source:
-        membrane on an elastic foundation: Timoshenko and Woinowsky-Krieger, Theory of Plates and Shells, 1959; redescending weights
-        by a shrinking scale: Blake and Zisserman, Visual Reconstruction, 1987.
+        membrane on an elastic foundation: Timoshenko and Woinowsky-Krieger, Theory of Plates and Shells, 1959; the weight of
+        deep skin is that of Geman and McClure.
     Example:
         >>> weight = torch.zeros(1, 1, 48, 64)
         >>> weight[..., 12:36, 16:48] = 1.0
@@ -60,7 +60,7 @@ class ZeroBackground(nn.Module):
     def __init__(self, mm_per_pixel: float) -> None:
         super().__init__()
         self.mm_per_pixel = check_positive("mm_per_pixel", mm_per_pixel)
-        self.cells, self.waves, self.scales = ZERO_CELLS, WAVES, list(SCALES)
+        self.cells, self.waves, self.face = ZERO_CELLS, WAVES, FACE
         self.decay_mm, self.smooth_mm, self.stiff = DECAY_MM, SMOOTH_MM, STIFF
         self.pit, self.pit_share = PIT, PIT_SHARE
 
@@ -96,22 +96,18 @@ class ZeroBackground(nn.Module):
         free = weight < 0.1
         any_free = free.flatten(1).any(dim=1)
         start = -lower_quartile(depth.flatten(1), free.flatten(1))
-        first = torch.zeros(depth.shape[0], k * m, dtype=depth.dtype, device=depth.device)
-        found = torch.cat((start, first[:, 1:]), dim=1)
-        pit = torch.zeros_like(depth)
-        for scale in self.scales:
-            z = depth + rows.t() @ found.reshape(-1, k, m) @ columns
-            unchanged = (1.0 - weight) / (1.0 + (z / (scale * reach)).square()).square()
-            pit = torch.maximum(pit, self.pit * weight * (-z / (self.pit_share * reach) - 1.0).clamp(0.0, 1.0))
-            stiff = self.smooth_mm**2 * (1.0 + self.stiff * (z / reach).clamp(0.0, 1.0).square())
-            system = products(unchanged, rows, columns) * by_pressure[:, None] * by_pressure
-            system = system + products(pit + 1e-6, rows, columns)
-            system = system + products(stiff, along_y, columns) + products(stiff, rows, along_x)
-            right = (rows @ (unchanged * pressure) @ columns.t()).flatten(1) * by_pressure
-            right = right + (rows @ (pit * depth) @ columns.t()).flatten(1)
-            solved = -torch.linalg.solve(system, right[..., None])[..., 0]
-            found = torch.where(any_free[:, None], solved, found)
-        return found.reshape(-1, k, m)
+        z = depth + start[:, :, None]
+        unchanged = (1.0 - weight) / (1.0 + (z / (self.face * reach)).square()).square()
+        pit = self.pit * weight * (-z / (self.pit_share * reach) - 1.0).clamp(0.0, 1.0)
+        stiff = self.smooth_mm**2 * (1.0 + self.stiff * (z / reach).clamp(0.0, 1.0).square())
+        system = products(unchanged, rows, columns) * by_pressure[:, None] * by_pressure
+        system = system + products(pit + 1e-6, rows, columns)
+        system = system + products(stiff, along_y, columns) + products(stiff, rows, along_x)
+        right = (rows @ (unchanged * pressure) @ columns.t()).flatten(1) * by_pressure
+        right = right + (rows @ (pit * depth) @ columns.t()).flatten(1)
+        solved = -torch.linalg.solve(system, right[..., None])[..., 0]
+        lowest = torch.cat((start, torch.zeros_like(solved[:, 1:])), dim=1)
+        return torch.where(any_free[:, None], solved, lowest).reshape(-1, k, m)
 
 
 def number_of_waves(height: int, width: int, waves: int) -> tuple[int, int]:

@@ -37,7 +37,7 @@
     /* zero.c; cosines along y (waves_y, cells) and x, their pairs of two transposed, at pixels, 1 + L^2 k^2 of each of them */               \
     INTEGER(zero_cell) INTEGER(waves_y) INTEGER(waves_x) TABLE(double, cosine_y) TABLE(double, cosine_x) TABLE(double, pairs_y)               \
     TABLE(double, pairs_x) TABLE(double, slope_pairs_y) TABLE(double, slope_pairs_x) TABLE(float, pixel_y) TABLE(float, pixel_x)              \
-    TABLE(double, by_pressure) REAL(zero_decay) TABLE(double, scales) INTEGER(rounds) REAL(smooth_mm) REAL(stiff) REAL(pit) REAL(pit_share)   \
+    TABLE(double, by_pressure) REAL(zero_decay) REAL(face) REAL(smooth_mm) REAL(stiff) REAL(pit) REAL(pit_share)                              \
     /* pressure.c */                                                                                                                          \
     REAL(moved_depth) INTEGER(contact_cell) TABLE(float, contact_blur) INTEGER(contact_taps) REAL(curvature_scale) INTEGER(contact_step)      \
     REAL(contact_kink) REAL(contact_decay) INTEGER(contact_by_frame) INTEGER(contact_steps) REAL(pull) REAL(pulling) REAL(least_deep) REAL(share) REAL(large) REAL(deep) INTEGER(rim_reach) REAL(fall)\

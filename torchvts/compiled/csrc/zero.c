@@ -175,28 +175,14 @@ static WIDE FUSED void project(const Plan *plan, const Work *at, const double *f
     }
 }
 
-/* The offset at the cells, of its coefficients. */
-static WIDE FUSED void expand(const Plan *plan, const Work *at, double *line) {
-    const int ky = (int)plan->waves_y, kx = (int)plan->waves_x;
-    for (int k = 0; k < at->n; k++) at->offset[k] = 0.0;
-    for (int i = 0; i < ky; i++) {
-        for (int x = 0; x < at->columns; x++) line[x] = 0.0;
-        for (int j = 0; j < kx; j++)
-            for (int x = 0; x < at->columns; x++) line[x] += at->found[i * kx + j] * plan->cosine_x[j * at->columns + x];
-        for (int y = 0; y < at->rows; y++)
-            for (int x = 0; x < at->columns; x++) at->offset[y * at->columns + x] += plan->cosine_y[i * at->rows + y] * line[x];
-    }
-}
-
-/* One round of the fit. */
-static void fit_offset(const Plan *plan, const Work *at, double scale, double reach) {
+/* The fit, from an offset that is the same everywhere. */
+static void fit_offset(const Plan *plan, const Work *at, double reach) {
     const size_t pairs = (size_t)at->pairs_y * at->pairs_x;
-    expand(plan, at, at->line);
     for (int k = 0; k < at->n; k++) {
-        const double z = at->depth[k] + at->offset[k], off = z / (scale * reach), fall = 1.0 + off * off;
+        const double z = at->depth[k] + at->found[0], off = z / (plan->face * reach), fall = 1.0 + off * off;
         const double below = fmin(fmax(-z / (plan->pit_share * reach) - 1.0, 0.0), 1.0), deep = fmin(fmax(z / reach, 0.0), 1.0);
         at->unchanged[k] = (1.0 - at->weight[k]) / (fall * fall);
-        at->pit[k] = fmax(at->pit[k], plan->pit * at->weight[k] * below);
+        at->pit[k] = plan->pit * at->weight[k] * below;
         at->stiff[k] = plan->smooth_mm * plan->smooth_mm * (1.0 + plan->stiff * deep * deep);
     }
     memset(at->by_pressure, 0, sizeof(double) * 2 * pairs);
@@ -254,8 +240,7 @@ int zero_background(const Plan *plan, const float *weight, float *depth) {
     const double reach = fmax(high - low, 1e-9);
     for (int k = 0; k < unknowns; k++) at.found[k] = 0.0;
     at.found[0] = start_of(&at, (float *)(memory + 7 * n), &any_free);
-    for (int k = 0; k < n; k++) at.pit[k] = 0.0;
-    for (int round = 0; round < plan->rounds && any_free; round++) fit_offset(plan, &at, plan->scales[round], reach);
+    if (any_free) fit_offset(plan, &at, reach);
     float *line = (float *)(at.found + unknowns);
     add_offset(plan, at.found, line, line + kx, depth);
     free(memory);

@@ -64,6 +64,32 @@ class Beside(nn.Module):
         return self.block(depth_mm, self.second.expand(depth_mm.shape[0], -1, -1, -1))
 
 
+class DotsOf(nn.Module):
+    """Tensors of the motion of dots in frames of undeformed depth."""
+
+    def __init__(self, block, kind):
+        super().__init__()
+        self.block = block
+        self.register_buffer("depth", torch.zeros(1, 1, HEIGHT, WIDTH, dtype=kind))
+
+    def forward(self, images: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        moved = self.block(images, self.depth)
+        return moved.displacement_mm, moved.covariance_mm2, moved.seen
+
+
+DOTTED = vts.scenes.DottedSkin(HEIGHT, WIDTH, PITCH, 6.0, 2.4, noise_std=0.002)
+
+
+def dotted(dtype):
+    drags = [vts.scenes.Drag(radius_mm=9.0, shift_mm=(x, -0.5), turn_deg=3.0, reach_mm=9.0) for x in (0.3, 1.0, 1.5)]
+    return torch.stack([DOTTED.image(drag, seed) for seed, drag in enumerate([*drags, None])]).to(dtype)
+
+
+def skin_motion(dtype):
+    unit = vts.Calibration.from_lights(DOTTED.lights, SENSOR, DOTTED.image())
+    return DotsOf(vts.SkinMotion.from_calibration(unit).to(dtype), dtype)
+
+
 def part(name):
     return lambda dtype: getattr(vts.DepthPipeline.from_calibration(calibration(dtype), "fast"), name)
 
@@ -117,6 +143,7 @@ CASES = {
     "DiscontinuityIntegration": (lambda dtype: DiscontinuityIntegration(PITCH), gradient, "gradient"),
     "AdaptiveIntegration": (lambda dtype: vts.AdaptiveIntegration(PITCH), gradient, "gradient"),
     "ZeroBackground": (lambda dtype: Beside(vts.skin.ZeroBackground(PITCH), dtype), depth, "depth_mm"),
+    "SkinMotion": (skin_motion, dotted, "images"),
     "ContactFromDepth": (lambda dtype: Beside(vts.ContactFromDepth(PITCH), torch.bool), depth, "depth_mm"),
     "DepthPipeline fast": (pipe("fast"), images, "images"),
     "DepthPipeline precise": (pipe("precise"), images, "images"),

@@ -9,8 +9,8 @@
   ``GradientFromNormal``, an ``Integrator``, ``ContactFromDepth``. Models are named ``NormalFrom...``, integrators ``Poisson...``
   and ``AdaptiveIntegration``; ``poisson_dct`` and the like are the same as functions.
 * Input: ``frames`` of images, folders, TIFFs, videos and cameras; ``read_image``, ``write_image``, ``read_result``.
-* With depth: ``depth_to_points``, ``register_depth``, ``PoseTracker``, ``ConfidentPipeline``, ``diagnose``, ``stream``.
-  ``scenes`` has exact scenes for tests.
+* With depth: ``depth_to_points``, ``SkinMotion``, ``register_depth``, ``PoseTracker``, ``ConfidentPipeline``, ``diagnose``,
+  ``stream``. ``scenes`` has exact scenes for tests.
 
 All parts are plain PyTorch modules. ``pipe.freeze()`` makes a ``FrozenPipeline``: the same, compiled, for cameras and recordings.
 """
@@ -37,7 +37,7 @@ from .model import Calibration, PointLights, Sensor, gs_sdk, near_field_shading,
 from .normals import NormalFromIntensity, NormalFromLookup, NormalFromMLP, NormalFromResponse, NormalModel
 from .pipeline import ConfidentPipeline, DepthOutput, DepthPipeline, FrozenPipeline
 from .pose import PoseTracker, register_depth, register_points
-from .skin import ContactFromDepth, ContactMask, ContactSettings
+from .skin import ContactFromDepth, ContactMask, ContactSettings, SkinMotion
 from .stream import frames
 
 __all__ = [
@@ -68,6 +68,7 @@ __all__ = [
     "Rectify",
     "Result",
     "Sensor",
+    "SkinMotion",
     "calibrate",
     "depth_to_points",
     "diagnose",

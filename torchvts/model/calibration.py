@@ -71,6 +71,8 @@ class Calibration:
             shows it.
         contact_decay_mm: length over which free skin decays for the pressure of contact, mm: the median that presses of balls show,
             0 where no skin hangs around them; None where there are none.
+        printed: (3, H, W) in [0, 1], the image without contact as the camera gives it, before its printed markers are filled; None
+            where there are none.
     Raises:
         TypeError: a field of another type.
         ValueError: lights, background, noise or ambient light of another shape, or not finite; a background without light; lights
@@ -89,6 +91,7 @@ class Calibration:
     contact_share: float | None = None
     contact_decay_mm: float | None = None
     covariance: Tensor | None = None
+    printed: Tensor | None = None
 
     def __post_init__(self) -> None:
         check_sensor("sensor", self.sensor)
@@ -125,6 +128,8 @@ class Calibration:
             raise ValueError("lights, response: expected one of them, got both: which of the two should give the normals?")
         if self.covariance is not None:
             self._check_covariance(self.covariance)
+        if self.printed is not None:
+            check_image("printed", self.printed, self.sensor.height, self.sensor.width, self.sensor.name)
         if not self.measured:
             return
         if not bool((self.background > self.light_noise_std).any()):
@@ -189,8 +194,8 @@ class Calibration:
             model = model if ambient is None else model + ambient.reshape(3, 1, 1)
             noise = torch.full((3,), UNKNOWN_NOISE, dtype=model.dtype)
             return cls(sensor, frozen, model, noise, False, summary, None, None, ambient)
-        light, noise, markers = _measure(background, sensor, frozen.position_mm.dtype)
-        return cls(sensor, frozen, light, noise, True, summary, None, markers, ambient)
+        light, noise, markers, printed = _measure(background, sensor, frozen.position_mm.dtype)
+        return cls(sensor, frozen, light, noise, True, summary, None, markers, ambient, printed=printed)
 
     @classmethod
     def from_response(
@@ -225,12 +230,12 @@ class Calibration:
         summary = read_report(
             {"model": "response", "source": "given", "doubts": []} | ({} if report is None else dict(report)), "report"
         )
-        light, noise, markers = _measure(background, sensor, background.dtype)
+        light, noise, markers, printed = _measure(background, sensor, background.dtype)
         if covariance is not None:
             check_tensor("covariance", covariance)
             covariance = covariance.detach().cpu().float()
             covariance = 0.5 * (covariance + covariance.mT)
-        return cls(sensor, None, light, noise, True, summary, response, markers, covariance=covariance)
+        return cls(sensor, None, light, noise, True, summary, response, markers, covariance=covariance, printed=printed)
 
     def __repr__(self) -> str:
         sensor, origin = self.sensor, "an image" if self.measured else "the lights alone"
@@ -418,8 +423,8 @@ class Calibration:
 
         Tensors by lights: S, rho, I_delta, the inverse light matrix, the background, the noise, and ambient light if there is
         any. Tensors by response: the noise, the background as a 16-bit PNG of the camera's values, which keeps an 8-bit image bit
-        for bit, and the upper triangle of the covariance, if there is one. JSON metadata: format version, sensor, response,
-        markers, report.
+        for bit, and the upper triangle of the covariance, if there is one. Where markers are printed, the image with them, as such
+        a PNG. JSON metadata: format version, sensor, response, markers, report.
         """
         metadata = {
             "format_version": FORMAT_VERSION,
@@ -433,6 +438,8 @@ class Calibration:
             "contact_decay_mm": self.contact_decay_mm,
         }
         tensors = {"noise_std": self.noise_std}
+        if self.printed is not None:
+            tensors["printed_png"] = image_to_bytes(self.printed)
         if self.lights is None:
             tensors["background_png"] = image_to_bytes(self.background.clamp(0, 1) ** (1.0 / self.sensor.exponent))
             if self.covariance is not None:
@@ -482,17 +489,18 @@ def check_calibration(name: str, value: object) -> None:
     check_record(name, value, Calibration, "Calibration.load reads a file, calibrate makes one")
 
 
-def _measure(background: Tensor, sensor: Sensor, dtype: torch.dtype) -> tuple[Tensor, Tensor, FillMarkers | None]:
-    """Linear light of a background image, its noise in image value, and the block that fills its markers."""
+def _measure(background: Tensor, sensor: Sensor, dtype: torch.dtype) -> tuple[Tensor, Tensor, FillMarkers | None, Tensor | None]:
+    """Linear light of a background image, its noise in image value, the block that fills its markers, and the image with them."""
     check_image("background", background, sensor.height, sensor.width, sensor.name)
     image = background.detach().cpu().to(dtype)
     markers = None if sensor.markers is False else FillMarkers.from_background(image)
     if markers is not None and (markers.diameter_px == 0 or (sensor.markers is None and not is_printed(image, markers))):
         markers = None
+    printed = None if markers is None else image.float().clamp(0.0, 1.0)
     if markers is not None:
         image = markers(image[None])[0]
     noise = noise_std(image[None])[0].clamp_min(QUANTISATION_STD)
-    return image if sensor.exponent == 1.0 else image**sensor.exponent, noise, markers
+    return image if sensor.exponent == 1.0 else image**sensor.exponent, noise, markers, printed
 
 
 def _load_by_response(path: str | Path, tensors: dict[str, Tensor], metadata: dict[str, Any], sensor: Sensor) -> Calibration:
@@ -508,7 +516,8 @@ def _load_by_response(path: str | Path, tensors: dict[str, Tensor], metadata: di
     noise, measured, report = tensors["noise_std"], metadata["measured"], metadata["report"]
     covariance = _load_covariance(path, tensors, response.field.size())
     contact = _load_contact(path, metadata)
-    return Calibration(sensor, None, light, noise, measured, report, response, markers, None, *contact, covariance)
+    printed = _load_printed(path, tensors, sensor)
+    return Calibration(sensor, None, light, noise, measured, report, response, markers, None, *contact, covariance, printed)
 
 
 def _load_by_lights(path: str | Path, tensors: dict[str, Tensor], metadata: dict[str, Any], sensor: Sensor) -> Calibration:
@@ -537,6 +546,7 @@ def _load_by_lights(path: str | Path, tensors: dict[str, Tensor], metadata: dict
         markers,
         ambient,
         *_load_contact(path, metadata),
+        printed=_load_printed(path, tensors, sensor),
     )
     for name, derived in (("compensation", calibration.compensation), ("inverse", calibration.inverse)):
         if not torch.allclose(tensors[name], derived, rtol=1e-3, atol=1e-3 * float(derived.abs().max())):
@@ -559,6 +569,12 @@ def _load_covariance(path: str | Path, tensors: dict[str, Tensor], size: int) ->
 
 def _load_markers(path: str | Path, metadata: dict[str, Any]) -> FillMarkers | None:
     return None if metadata.get("markers") is None else FillMarkers.from_dict(metadata["markers"], f"{path}: markers")
+
+
+def _load_printed(path: str | Path, tensors: dict[str, Tensor], sensor: Sensor) -> Tensor | None:
+    if "printed_png" not in tensors:
+        return None
+    return image_from_bytes(tensors["printed_png"], (sensor.height, sensor.width), f"{path}: tensor 'printed_png'").float()
 
 
 def _load_contact(path: str | Path, metadata: dict[str, Any]) -> tuple[float | None, float | None]:

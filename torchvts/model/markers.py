@@ -142,6 +142,31 @@ REGULAR = 0.75
 """Share of them that lie as far from their nearest neighbour as usual, within a fifth: 0.88 and more of patterns."""
 
 
+def find_dots(background: Tensor, markers: "FillMarkers") -> Tensor:
+    """Centres of the printed dots of a background (3, H, W): (N, 2) float64, x and y in pixels; specks are none.
+
+    A centre is the mean place of what a dot takes from the logarithm of light.
+
+    Example:
+        >>> image = torch.full((3, 64, 64), 0.5)
+        >>> image[:, 20:27, 30:37] = 0.1
+        >>> find_dots(image, FillMarkers())
+        tensor([[33., 23.]], dtype=torch.float64)
+    """
+    import cv2
+
+    if markers.diameter_px == 0.0:
+        return torch.zeros(0, 2, dtype=torch.float64)
+    found = find_markers(background[None], markers.diameter_px, markers.contrast, markers.sigmas, markers.margin)
+    count, label, stats, _ = cv2.connectedComponentsWithStats(found[0, 0].cpu().numpy().astype(np.uint8))
+    light = torch.log(background.detach().cpu().double() + 0.03).mean(0)
+    dark = (fill_markers(light[None, None], found.cpu())[0, 0] - light).clamp_min(1e-6)
+    y, x = torch.meshgrid(torch.arange(light.shape[0]), torch.arange(light.shape[1]), indexing="ij")
+    sums = [torch.bincount(torch.from_numpy(label).long().flatten(), (dark * of).flatten(), count)[1:] for of in (x, y, 1.0)]
+    size = torch.from_numpy(stats[1:, cv2.CC_STAT_AREA]).double()
+    return torch.stack((sums[0] / sums[2], sums[1] / sums[2]), 1)[size > 0.3 * size.median() if len(size) else size > 0]
+
+
 def is_printed(background: Tensor, markers: "FillMarkers") -> bool:
     """Whether what is found in a background (3, H, W) is a regular pattern of dots, and not dust.
 
@@ -152,15 +177,7 @@ def is_printed(background: Tensor, markers: "FillMarkers") -> bool:
         >>> is_printed(image, FillMarkers.from_background(image))
         True
     """
-    import cv2
-    import numpy as np
-
-    if markers.diameter_px == 0.0:
-        return False
-    found = find_markers(background[None], markers.diameter_px, markers.contrast, margin=markers.margin)[0, 0]
-    _, _, stats, centres = cv2.connectedComponentsWithStats(found.numpy().astype(np.uint8))
-    size = stats[1:, cv2.CC_STAT_AREA]
-    dots = torch.from_numpy(centres[1:][size > 0.3 * np.median(size)]) if len(size) else torch.zeros(0, 2)
+    dots = find_dots(background, markers)
     if len(dots) < LEAST_PRINTED:
         return False
     nearest = torch.cdist(dots, dots).fill_diagonal_(torch.inf).amin(dim=1)

@@ -31,6 +31,7 @@ from ..core.spelling import suggest
 from ..core.strict_yaml import read_yaml
 from .camera_view import (
     CameraView,
+    camera_above,
     check_corners,
     check_lens,
     check_raw_sizes,
@@ -205,6 +206,17 @@ class Sensor:
     def field_mm(self) -> tuple[float, float]:
         """Height and width of the field of view, mm."""
         return self.height * self.mm_per_pixel, self.width * self.mm_per_pixel
+
+    @property
+    def camera_mm(self) -> tuple[float, float, float] | None:
+        """Where ``camera_matrix`` puts the camera above the middle of the skin: x, y, height; None where it is not known.
+
+        Example:
+            >>> lens = {"camera_matrix": [[400, 0, 159.5], [0, 400, 119.5], [0, 0, 1]], "distortion_coefficients": [0] * 5}
+            >>> [round(abs(v), 6) for v in Sensor(name="rig", height=240, width=320, mm_per_pixel=0.05, **lens).camera_mm]
+            [0.0, 0.0, 20.0]
+        """
+        return camera_above(self._view, self.raw_size_px[0] if self.raw_size_px else None, self.mm_per_pixel)
 
     def resized(self, height: int, width: int) -> "Sensor":
         """The same sensor with other pixels: field of view, lights and response stay; pitch and blur are scaled.

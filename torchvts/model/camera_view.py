@@ -4,6 +4,7 @@ import math
 from functools import lru_cache
 from typing import TYPE_CHECKING, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -178,39 +179,38 @@ def _misfit(view: CameraView, rows: int, columns: int) -> str:
     return f"expected {height} x {width}{others} for sensor '{view.name}', got {rows} x {columns}: {cause}"
 
 
-def camera_above(view: CameraView, raw_size: tuple[int, int] | None, mm_per_pixel: float) -> tuple[float, float, float] | None:
-    """Where the camera of a view stands above the middle of the skin, mm: along x and y of the image, and height.
+def camera_above(sensor: "Sensor") -> tuple[float, float, float] | None:
+    """Where the camera of a sensor stands above the middle of the skin, mm: along x and y of the image, and height.
 
     Four corners of the skin, which is a plane, and their places in frames without distortion give its pose.
 
-    Args:
-        view: with a camera matrix.
-        raw_size: (height, width) of raw frames; only turned or mirrored ones, and those without a region or corners, need it.
-        mm_per_pixel: pitch of the image.
     Returns:
-        None without a camera matrix, or where the size of raw frames must be known and is not.
+        None without a camera matrix, or where the size of raw frames must be known and is not: of turned or mirrored ones, and of
+        those without a region or corners.
     Source:
         Zhang, A flexible new technique for camera calibration, PAMI 22(11), 2000, section 3.1.
     """
-    height, width = view.size
-    if view.camera_matrix is None or (raw_size is None and (view.turn_deg or view.mirror or not (view.corners_px or view.roi_px))):
+    height, width = sensor.height, sensor.width
+    raw_size = sensor.raw_size_px[0] if sensor.raw_size_px else None
+    placed = sensor.corners_px or sensor.roi_px
+    if sensor.camera_matrix is None or (raw_size is None and (sensor.turn_deg or sensor.mirror or not placed)):
         return None
-    rows, columns = (1, 1) if raw_size is None else raw_size if view.turn_deg % 180 == 0 else raw_size[::-1]  # of turned frames
+    rows, columns = (1, 1) if raw_size is None else raw_size if sensor.turn_deg % 180 == 0 else raw_size[::-1]  # of turned frames
     corners = np.array([[0.0, 0.0], [width - 1.0, 0.0], [width - 1.0, height - 1.0], [0.0, height - 1.0]])
-    if view.corners_px is not None:
-        frame = np.array(view.corners_px)
+    if sensor.corners_px is not None:
+        frame = np.array(sensor.corners_px)
     else:
-        top, left = int(view.raw_crop * rows), int(view.raw_crop * columns)
-        region = view.roi_px or (left, top, columns - 2 * left, rows - 2 * top)
+        top, left = int(sensor.raw_crop * rows), int(sensor.raw_crop * columns)
+        region = sensor.roi_px or (left, top, columns - 2 * left, rows - 2 * top)
         frame = (corners + 0.5) * np.array(region[2:]) / (width, height) - 0.5 + np.array(region[:2])
-    if view.mirror:
+    if sensor.mirror:
         frame = np.stack((columns - 1.0 - frame[:, 0], frame[:, 1]), 1)
-    for _ in range(view.turn_deg // 90):  # back by 90 degrees, clockwise
+    for _ in range(sensor.turn_deg // 90):  # back by 90 degrees, clockwise
         frame, rows, columns = np.stack((rows - 1.0 - frame[:, 1], frame[:, 0]), 1), columns, rows
-    (fx, skew, cx), (_, fy, cy), _ = view.camera_matrix
+    (fx, skew, cx), (_, fy, cy), _ = sensor.camera_matrix
     ray = (frame - (cx, cy)) / (fx, fy)
     ray[:, 0] -= skew / fx * ray[:, 1]
-    skin = (corners - (0.5 * (width - 1), 0.5 * (height - 1))) * mm_per_pixel
+    skin = (corners - (0.5 * (width - 1), 0.5 * (height - 1))) * sensor.mm_per_pixel
     ones, zeros = np.ones((4, 1)), np.zeros((4, 3))
     plane = np.hstack((skin, ones))
     system = np.vstack((np.hstack((plane, zeros, -ray[:, :1] * plane)), np.hstack((zeros, plane, -ray[:, 1:] * plane))))

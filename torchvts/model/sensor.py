@@ -216,7 +216,7 @@ class Sensor:
             >>> [round(abs(v), 6) for v in Sensor(name="rig", height=240, width=320, mm_per_pixel=0.05, **lens).camera_mm]
             [0.0, 0.0, 20.0]
         """
-        return camera_above(self._view, self.raw_size_px[0] if self.raw_size_px else None, self.mm_per_pixel)
+        return camera_above(self)
 
     def resized(self, height: int, width: int) -> "Sensor":
         """The same sensor with other pixels: field of view, lights and response stay; pitch and blur are scaled.

@@ -22,6 +22,16 @@ SHARES = [*(value for value in NUMBER if value is not None), 1.5]
 DECAYS_MM = [*(value for value in NUMBER if value not in (None, 0)), 450.0]
 
 
+DOTTED = vts.scenes.DottedSkin(48, 64, 1.0, 10.0, 4.0)
+DOTS_PX = torch.stack(torch.meshgrid(torch.arange(8.0, 60.0, 10.0), torch.arange(9.0, 42.0, 10.0), indexing="xy"), -1).reshape(
+    -1, 2
+)
+
+
+def dotted_unit():
+    return vts.Calibration.from_lights(DOTTED.lights, vts.Sensor("rig", 48, 64, 1.0), DOTTED.image())
+
+
 def integrator(name):
     """A class of integrators, the public one if there is one."""
     return getattr(vts, name, None) or getattr(torchvts.integration, name)
@@ -57,6 +67,15 @@ TABLE = {
     "ContactFromDepth.forward": Entry({"depth_mm": DEPTH, "deformed": DEPTH > 0},
         {"depth_mm": batches(1), "deformed": [DEPTH, *(mask > 0 for mask in OTHER_DEPTHS), (DEPTH > 0).numpy(), None]},
         lambda: vts.ContactFromDepth(1.0)),
+    "SkinMotion": Entry({"background": DOTTED.image(), "dots_px": DOTS_PX, "diameter_px": 4.0, "mm_per_pixel": 1.0,
+        "camera_mm": (0.0, 0.0, 30.0)}, {"background": [DOTTED.image()[None], None, "image.png", 255 * DOTTED.image()],
+        "dots_px": [DOTS_PX[:, :1], DOTS_PX + NAN, DOTS_PX.long(), DOTS_PX.tolist(), None], "diameter_px": NUMBER,
+        "camera_mm": [(0.0, 0.0), (0.0, 0.0, -1.0), (NAN, 0.0, 30.0), "up", 30.0]}),
+    "SkinMotion.from_calibration": Entry({"calibration": dotted_unit(), "camera_mm": None},
+        {"calibration": [*OTHERS, unit()], "camera_mm": [(0.0, 0.0), (0.0, 0.0, -1.0), "up", 30.0]}),
+    "SkinMotion.forward": Entry({"images": DOTTED.image()[None], "depth_mm": torch.zeros(1, 1, 48, 64), "last": None},
+        {"images": [*batches(3, 48, 64), DOTTED.image()[None, :, 1:]], "depth_mm": [*batches(1, 48, 64), torch.zeros(1, 1, 48, 60)],
+        "last": [torch.zeros(1, 4, 3), "last", 3]}, lambda: vts.SkinMotion.from_calibration(dotted_unit())),
     "ContactSettings": Entry({"sigmas": 4.5, "share": 0.8, "decay_mm": 0.3},
         {"sigmas": NUMBER, "share": SHARES, "decay_mm": DECAYS_MM}),
     "ZeroBackground": Entry({"mm_per_pixel": 1.0}, {}),

@@ -24,6 +24,7 @@ from .model import Calibration
 from .model.report import PressRow
 from .model.stated_error import error_over_skin
 from .pipeline import DepthPipeline
+from .skin import DotMotion
 
 Array = np.ndarray[Any, Any]
 
@@ -98,6 +99,7 @@ def depth_figure(
     exaggeration: float | None = None,
     metric: bool = True,
     doubts: Sequence[str] = (),
+    moved: DotMotion | None = None,
 ) -> Figure:
     """One frame as three panels of one extent: the camera's image with the contact outlined, depth contours, the shaded surface.
 
@@ -110,6 +112,7 @@ def depth_figure(
         exaggeration: of the surface's heights; None takes :func:`exaggeration_of` this depth.
         metric: whether depth is in mm; otherwise the title and the bar say that it is not.
         doubts: why not to trust it, a sentence each, above the panels.
+        moved: of one frame, whose printed dots are drawn as arrows over the image; None for none.
     """
     depth = _plane(depth_mm)
     title += "" if metric else ", NOT METRIC"
@@ -134,6 +137,8 @@ def depth_figure(
         axes.imshow(picture, extent=_extent(depth, mm_per_pixel))
         if contact is not None and bool(contact.any()):
             draw_outline(axes, _plane(contact.float()), mm_per_pixel)
+        if moved is not None:
+            draw_motion(axes, moved)
         axes.set_title("image" if contact is None else "image, contact outlined", fontsize=10)
         _millimetres(axes)
         left += wide + 0.5
@@ -156,6 +161,25 @@ def draw_outline(axes: Any, mask: Array, mm_per_pixel: float, color: str = "whit
         mask, [0.5], colors=color, linewidths=1.0, linestyles=style, extent=_extent(mask, mm_per_pixel), origin="upper"
     )
     drawn.set_path_effects(_HALO)
+
+
+def draw_motion(axes: Any, moved: DotMotion, frame: int = 0) -> None:
+    """Arrows of printed dots from rest over an image in mm, in true length, and a bar of the largest one's decade.
+
+    A dot that is not seen has none; a short arrow is a point.
+    """
+    seen = moved.seen[frame].cpu()
+    rest = moved.rest_mm.detach().cpu()[seen]
+    step = moved.displacement_mm[frame].detach().cpu()[seen, :2]
+    origin = torch.tensor([moved.width, moved.height]) * (0.5 * moved.mm_per_pixel)  # extents begin at the image's corner
+    x, y = (rest + origin).T.numpy()
+    axes.quiver(x, y, *step.T.numpy(), angles="xy", scale_units="xy", scale=1.0, color=SOURCE, width=0.006, minlength=0.5)
+    longest = float(step.norm(dim=1).max()) if len(step) else 0.0
+    if longest > 0.0:
+        bar = 10.0 ** math.floor(math.log10(longest))
+        left, low = 0.04 * moved.width * moved.mm_per_pixel, 0.94 * moved.height * moved.mm_per_pixel
+        axes.plot([left, left + bar], [low, low], color="white", lw=2.5, path_effects=_HALO)
+        axes.text(left, 0.985 * low, f"{bar:g} mm", color="white", fontsize=7, va="bottom", path_effects=_HALO)
 
 
 def draw_contours(

@@ -116,6 +116,18 @@ def little_known(seed):
     return None, unit.ball(5.0, 0.7, (0.5, 0.5), "other", seed).image, unsure
 
 
+def dotted(change):
+    """A skin with printed dots: ``change`` gives what an object does, and what is left of each dot."""
+
+    def make(seed):
+        skin = scenes.DottedSkin(120, 160, 0.125)
+        unit = vts.Calibration.from_lights(skin.lights, vts.Sensor("rig", 120, 160, 0.125), skin.image(seed=seed))
+        drag, left = change(skin)
+        return None, skin.image(drag, seed + 1, left), unit
+
+    return make
+
+
 TRIGGERS = {
     # the calibration
     "calibration_saturated": gallery("saturation", 2.0),
@@ -154,6 +166,8 @@ TRIGGERS = {
     "blurred, by motion": gallery("motion blur", 10.0),
     "blurred, by other skin": gallery("inter-reflection", 0.2),
     "blurred, texture": grained(softened),
+    "dots_lost": dotted(lambda skin: (None, (torch.arange(len(skin.dots_mm)) % 3 == 0).double())),
+    "dots_shifted": dotted(lambda skin: (scenes.Drag(radius_mm=60.0, shift_mm=(0.2, -0.1)), None)),
     # the scene
     "no_contact": gallery("faint contact", 0.0),
     "contact_covers_image": gallery("covers the image", 1.0),

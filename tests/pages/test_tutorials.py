@@ -46,3 +46,10 @@ def test_own_sensor(empty_folder):
 def test_training_through_depth(empty_folder):
     names = run(ROOT / "docs" / "training.md", runpy.run_path(str(ROOT / "examples" / "own_network.py")))
     assert names["lights"].albedo.grad is not None
+
+
+def test_the_page_on_motion_runs_and_finds_the_drag():
+    names = run(ROOT / "docs" / "motion.md")
+    assert names["field"].shape == (1, 3, 120, 160) and int(names["moved"].seen.sum()) > 50
+    assert abs(float(names["slip"].turn_deg) - 4.0) < 0.5
+    assert abs(float(names["slip"].shift_mm[0, 0]) - 0.3) < 0.03

@@ -14,6 +14,7 @@ import argparse
 from pathlib import Path
 
 from ..core.results import Facts, write_result
+from ..skin import motion_of_unit
 from ..stream import Keys, LiveView, StreamReport, TactileFrame, TactileStream, has_screen, require_rerun
 from ..stream.view import EXAGGERATION
 from ..viz import depth_figure, save_figure
@@ -89,8 +90,11 @@ class _Viewing:
         metric, doubts, doubt = self.stream.metric, self.stream.calibration.report.get("doubts", []), self.stream.doubt
         write_result(path, frame.output, Facts(sensor.mm_per_pixel, "", sensor.name, metric, doubts), str(frame.number), doubt)
         title, said = f"{sensor.name}, {frame.time_s:.2f} s", [f"IN DOUBT: {doubt}"] if doubt else []
+        motion = motion_of_unit(self.stream.calibration)
+        moved = None if motion is None else motion(frame.image.reshape(1, *frame.image.shape[-3:]), frame.output.depth_mm)
+        contact = frame.output.contact
         figure = depth_figure(
-            frame.output.depth_mm, sensor.mm_per_pixel, frame.image, frame.output.contact, title, metric=metric, doubts=said
+            frame.output.depth_mm, sensor.mm_per_pixel, frame.image, contact, title, metric=metric, doubts=said, moved=moved
         )
         save_figure(figure, path.with_suffix(".png"))
         print(f"wrote {path} and .png")

@@ -33,7 +33,7 @@ from ..core.recordings import count_frames, cut_short, video_codec
 from ..model import Calibration
 from ..pipeline import MODES, DepthOutput, unit_pipeline
 from ..pose.output_frame import MM_OF
-from ..skin import ContactSettings
+from ..skin import ContactSettings, motion_of_unit
 from ..stream import FIRST_FRAMES, Recording, check_device
 from .items import Item, Source, list_items
 from .loading import Entry, load_frames
@@ -207,6 +207,7 @@ class _Worker:
     ) -> None:
         self.unit, self.records, self.settings, self.share, self.strict = unit, records, records.settings, share, strict
         self.sensor, self.writer = unit.sensor, Writer(records, unit, name)
+        self.writer.motion = motion_of_unit(unit) if records.settings.pictures else None
         thresholds = None if self.settings.contact is None else ContactSettings(**self.settings.contact)
         self.recording = partial(
             Recording, unit, self.settings.mode, network=network, device=self.settings.device, contact=thresholds

@@ -16,6 +16,7 @@ from ..model.report import warnings_of
 from ..pipeline import DepthOutput
 from ..pose import OutputFrame, write_point_cloud
 from ..pose.surface_files import write_obj
+from ..skin import SkinMotion
 from .loading import Entry
 from .records import VIDEO_FORMAT, Records
 
@@ -28,6 +29,7 @@ class Writer:
         self.facts = Facts(unit.sensor.mm_per_pixel, name, unit.sensor.name, unit.metric, unit.report.get("doubts", []))
         self.warnings = warnings_of(unit.report)
         self.frame = OutputFrame(records.settings.length_unit, unit.sensor)
+        self.motion: SkinMotion | None = None  # of printed dots, drawn in pictures
         self.exaggeration: float | None = None  # of heights in all pictures, known from the first contact on
 
     def write(self, frame: Entry, image: Tensor, result: DepthOutput) -> None:
@@ -53,8 +55,9 @@ class Writer:
             if self.exaggeration is None and bool(result.contact.any()):
                 self.exaggeration = viz.exaggeration_of(float(result.depth_mm.max()), pitch * result.depth_mm.shape[3])
             doubts = [*self.warnings, *([f"IN DOUBT: {frame.doubt}"] if frame.doubt else [])]
+            moved = None if self.motion is None else self.motion(image.reshape(1, *image.shape[-3:]), result.depth_mm)
             figure = viz.depth_figure(
-                result.depth_mm, pitch, image, result.contact, name, self.exaggeration, self.facts.metric, doubts
+                result.depth_mm, pitch, image, result.contact, name, self.exaggeration, self.facts.metric, doubts, moved
             )
             viz.save_figure(figure, f"{stem}_picture.png")
 

@@ -20,6 +20,9 @@ from .findings import FAULT_DEG, WARNING_DEG, Finding, by_cost
 
 CHANNELS = ("red", "green", "blue")
 
+FEWEST_FREE_DOTS = 8
+"""Dots of free skin from which its shift is told."""
+
 LEAST_LIGHT = 0.05
 """Change of a channel's light that is reported, relative."""
 
@@ -280,6 +283,28 @@ def _length(e: Examination, sign: float) -> float | None:
     return this if this > other else None
 
 
+def _dots(e: Examination) -> Figures | None:
+    """Share of the background's dots that the image does not show."""
+    if e.motion is None:
+        return None
+    seen, every = int(e.motion.seen.sum()), e.motion.seen.numel()
+    return {"value": 1.0 - seen / every, "seen": seen, "all": every}
+
+
+def _dots_alike(e: Examination) -> Figures | None:
+    """Shift of the dots of free skin, px, where they moved alike."""
+    if e.motion is None:
+        return None
+    pitch, size = e.motion.mm_per_pixel, (e.motion.width, e.motion.height)
+    x, y = (e.motion.rest_mm / pitch + 0.5 * torch.tensor([size[0] - 1.0, size[1] - 1.0])).round().long().T
+    moved = e.motion.displacement_mm[0, e.motion.seen[0] & e.free[y, x], :2] / pitch
+    if len(moved) < FEWEST_FREE_DOTS:
+        return None
+    shift = moved.median(dim=0).values
+    length, spread = float(shift.norm()), float((moved - shift).norm(dim=1).median())
+    return {"value": length, "mm": length * pitch} if spread < 0.3 * length else None
+
+
 # ---- the scene -----------------------------------------------------------------------------------------------------------------
 
 
@@ -392,6 +417,10 @@ CHECKS = (
     Check("blurred", lambda e: _length(e, -1.0), "{value:.0%} of the contact gets light from its surroundings: the image is "
           "blurred or moved, or other skin lights it (inter-reflection); focus, expose shorter, use a darker coating",
           above=MISFITS, alone=True),
+    Check("dots_lost", _dots, "only {seen:.0f} of the skin's {all:.0f} printed dots are found: another skin or another pattern, a "
+          "background that was pressed, or a frame that jumped; motion of dots needs the unit's own background", above=0.5),
+    Check("dots_shifted", _dots_alike, "the dots of free skin have all moved alike by {value:.1f} px ({mm:.2f} mm): the camera or "
+          "the gel has moved in its frame, or all skin is sheared; calibrate again where nothing touches it", "note", above=0.5),
     # the scene
     Check("no_contact", _no_contact, "no contact: nothing is above the noise", "note", last=True),
     Check("contact_covers_image", lambda e: float(e.moved.double().mean()), "the skin has moved in {value:.0%} of the image: "

@@ -18,6 +18,7 @@ from ..model import Calibration
 from ..model.lights import inverse_light_matrix
 from ..model.usable import FrameCheck
 from ..pipeline import DepthPipeline, usual_unseen_deg
+from ..skin import DotMotion, motion_of_unit
 from ..skin.weight import spread_of
 from .camera import levels_of
 
@@ -95,6 +96,13 @@ class Examination:
         with torch.no_grad():
             result: DepthOutput = self.pipeline(self.raw[None].to(self.unit.background.dtype))
         return result
+
+    @cached_property
+    def motion(self) -> DotMotion | None:
+        """Of the skin's printed dots; None where there are none."""
+        follow = motion_of_unit(self.unit)
+        with torch.no_grad():
+            return None if follow is None else follow(self.raw[None].float(), self.output.depth_mm.float())
 
     @cached_property
     def moved(self) -> Tensor:

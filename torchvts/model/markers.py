@@ -150,7 +150,7 @@ def find_dots(background: Tensor, markers: "FillMarkers") -> Tensor:
     Example:
         >>> image = torch.full((3, 64, 64), 0.5)
         >>> image[:, 20:27, 30:37] = 0.1
-        >>> find_dots(image, FillMarkers())
+        >>> find_dots(image, FillMarkers()).round(decimals=3)
         tensor([[33., 23.]], dtype=torch.float64)
     """
     import cv2

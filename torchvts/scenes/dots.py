@@ -7,7 +7,16 @@ import torch
 from torch import Tensor, nn
 
 from ..core.blur import blur, gaussian_weights
-from ..core.checks import check_camera_height, check_choice, check_float_tensor, check_least, check_positive, check_seed, check_size
+from ..core.checks import (
+    check_camera_height,
+    check_choice,
+    check_float_tensor,
+    check_least,
+    check_numbers,
+    check_positive,
+    check_seed,
+    check_size,
+)
 from ..core.geometry import gradient_of_depth, normal_from_gradient, pixel_grid_mm
 from ..model.lights import PointLights, near_field_shading
 
@@ -52,7 +61,9 @@ class Drag:
     reach_mm: float = 2.5
 
     def __post_init__(self) -> None:
+        check_numbers("center_mm", self.center_mm, (2,)), check_numbers("shift_mm", self.shift_mm, (2,))
         check_positive("radius_mm", self.radius_mm), check_positive("reach_mm", self.reach_mm)
+        check_least("turn_deg", self.turn_deg, -math.inf), check_least("bulge_mm", self.bulge_mm, -math.inf)
         check_least("press_mm", self.press_mm), check_least("stuck", self.stuck, 0.0, 1.0)
 
     def displacement_mm(self, points_mm: Tensor) -> Tensor:
@@ -120,6 +131,8 @@ class DottedSkin:
             check_choice("pattern", self.pattern, ("square", "hexagonal")),
             check_choice("shape", self.shape, ("round", "square", "ring")),
         )
+        if not all(0.0 <= share < 1.0 for share in check_numbers("darkness", self.darkness, (3,))):
+            raise ValueError(f"darkness: expected shares of light in [0, 1), got {self.darkness}")
         check_least("worn", self.worn, 0.0, 0.2), check_least("blur_px", self.blur_px), check_least("noise_std", self.noise_std)
         check_camera_height(self.camera_height_mm), check_seed("seed", self.seed)
 

@@ -7,9 +7,10 @@ import torch
 from torch import Tensor, nn
 
 from ..core.checks import (
+    MOST_NUMBER,
     check_batch,
-    check_camera_height,
     check_field,
+    check_float_tensor,
     check_numbers,
     check_positive,
     check_range,
@@ -103,6 +104,9 @@ class SkinMotion(nn.Module):
             check_positive("mm_per_pixel", mm_per_pixel),
         )
         self.height, self.width = background.shape[1], background.shape[2]
+        check_float_tensor("dots_px", dots_px)
+        if dots_px.dim() != 2 or dots_px.shape[1] != 2 or not bool(torch.isfinite(dots_px).all()):
+            raise ValueError(f"dots_px: expected finite places (N, 2), got {tuple(dots_px.shape)}: find_dots gives them")
         rim = 0.5 * self.diameter_px
         most = dots_px.new_tensor([self.width - 1.0, self.height - 1.0]) - rim
         dots = dots_px[((dots_px > rim) & (dots_px < most)).all(dim=1)].to(background.dtype)
@@ -116,8 +120,7 @@ class SkinMotion(nn.Module):
         near, index = distance.topk(min(NEIGHBOURS, len(dots) - 1), largest=False)
         apart = (dots[index] - dots[:, None]) / self.spacing_px
         self.knows_camera = camera_mm is not None
-        x, y, height = (0.0, 0.0, math.inf) if camera_mm is None else camera_mm
-        check_camera_height(height), check_numbers("camera_mm", (x, y), (2,))
+        x, y, height = (0.0, 0.0, math.inf) if camera_mm is None else check_camera(camera_mm)
         self.agrees, self.rounds, self.steps, self.settles, self.nearest_mm = AGREES, ROUNDS, STEPS, 2, NEAREST_CAMERA_MM
         self.bend, self.pedestal, self.depth_share, self.depth_mm = BEND, PEDESTAL, DEPTH_SHARE, DEPTH_MM
         for name, value in (
@@ -188,6 +191,8 @@ class SkinMotion(nn.Module):
         check_same_size("depth_mm", depth_mm, "images", self.height, self.width)
         check_same_count("depth_mm", depth_mm, "images", images.shape[0])
         if last is not None:
+            if not torch.jit.is_scripting():
+                check_last(last)
             check_same_count("last", last.displacement_mm, "images", images.shape[0])
             if last.displacement_mm.shape[1] != self.rest_px.shape[0]:
                 raise ValueError(
@@ -336,3 +341,27 @@ class SkinMotion(nn.Module):
         axis = self.camera[:2]
         seen = (rest + displacement_mm[..., :2] - axis) / (1.0 - displacement_mm[..., 2:] * self.camera[2]) + axis
         return seen / self.mm_per_pixel + 0.5 * size
+
+
+def motion_of_unit(calibration: Calibration) -> SkinMotion | None:
+    """The module of a calibrated unit; None where its skin has no dots that could be followed."""
+    try:
+        return None if calibration.printed is None else SkinMotion.from_calibration(calibration)
+    except ValueError:
+        return None
+
+
+def check_last(value: object) -> None:
+    """Raise unless it is a :class:`DotMotion`, or what a script gives in its place."""
+    if not hasattr(value, "displacement_mm"):
+        raise TypeError(f"last: expected a DotMotion, got {type(value).__name__}: what the module gave for the frame before")
+
+
+def check_camera(value: object) -> tuple[float, float, float]:
+    """Return (x, y, height) of a camera, mm, or raise; an infinite height means an orthographic camera."""
+    if isinstance(value, tuple | list) and len(value) == 3 and value[2] == math.inf:
+        value = (*value[:2], MOST_NUMBER)
+    x, y, height = check_numbers("camera_mm", value, (3,))
+    if height <= 0.0:
+        raise ValueError(f"camera_mm: expected a camera above the skin, (x, y, height), got {value!r}")
+    return x, y, height

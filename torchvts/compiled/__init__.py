@@ -2,6 +2,6 @@
 
 from .binding import library, why_no_library
 from .blocks import NotCompiled, check_block
-from .plan import Plan, ends
+from .plan import Plan, PlanError, plan_bytes
 
-__all__ = ["NotCompiled", "Plan", "check_block", "ends", "library", "why_no_library"]
+__all__ = ["NotCompiled", "Plan", "PlanError", "check_block", "library", "plan_bytes", "why_no_library"]

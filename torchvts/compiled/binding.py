@@ -1,4 +1,4 @@
-"""The compiled library: loaded once, its functions with their types, and the layout of a plan as it says it."""
+"""The compiled library: loaded once, its functions with their types. csrc/torchvts.h explains those that others call too."""
 
 import ctypes
 import functools
@@ -11,11 +11,10 @@ LIBRARY = Path(__file__).parent / "csrc" / "libtorchvts.so"
 
 SIGNATURES = {
     "plan_fields": "s",
-    "plan_size": "l",
-    "range": "v p l p",
-    "reconstruct": "i p p p p p p p p",
-    "poisson_plan_size": "l i",
-    "make_poisson_plan": "v i i p",
+    "vts_load": "p p l p",
+    "vts_info": "v p p",
+    "vts_depth": "i p p i p",
+    "vts_free": "v p",
     "alignment_sums": "v p i i p l i i p p",
     "part_sums": "v p i i p l i i p p",
     "height_sums": "i p i i p l i p p p p p i i d d p",

@@ -19,7 +19,7 @@ from ..skin import ContactFromDepth, ContactMask, ZeroBackground
 from ..skin import pressure as pressure_module
 from ..skin import weight as weight_module
 from ..skin import zero as zero_module
-from .plan import Values, poisson_tables
+from .plan import Values
 
 LIGHTS = 8193
 """Values of a camera whose light stands in a table: between them light^2.2 is a line to 5e-9."""
@@ -259,19 +259,15 @@ def _polynomials(maps: Tensor, place: Tensor, degree: int) -> Tensor | None:
 
 
 def solver_values(name: str, block: nn.Module, values: Values) -> Values:
-    """Of an integrator, for the size and pitch in ``values``.
+    """Of an integrator, for the pitch in ``values``; its tables the library makes.
 
     Raises:
-        NotCompiled: another integrator, another pitch, or a height whose cosine transform is slow.
+        NotCompiled: another integrator, or another pitch.
     """
     check_block(name, block, PoissonDCT, PoissonBackground)
     assert isinstance(block, PoissonDCT)
-    height, width = values["height"], values["width"]
     check_equal(f"{name}.mm_per_pixel", block.mm_per_pixel, values["mm_per_pixel"])
-    tables = poisson_tables(height, width)
-    if tables is None:
-        raise NotCompiled(f"{name} has no fast cosine transform for {height} x {width} px")
-    return {"poisson": tables, "zeroed": block.zero_in_background}
+    return {"zeroed": block.zero_in_background}
 
 
 def mask_values(block: nn.Module, size: tuple[int, int], takes_slopes: bool) -> Values:

@@ -1,7 +1,11 @@
-"""A plan: the numbers and tables that the compiled stages of a frame read, in the structure that the library says."""
+"""A plan: what a frame needs, as one file that C, robots and pages read too. docs/plan.md states its layout."""
 
 import ctypes
 import functools
+import json
+import struct
+import weakref
+import zlib
 from collections.abc import Mapping
 from typing import Any
 
@@ -12,60 +16,129 @@ from .binding import check_memory, loaded
 
 Values = dict[str, Any]
 
+VERSION = 1
+"""Of the file; csrc/load.h has it too."""
+
+LINE = 64
+"""Bytes: the head, each record and each table begin at a multiple of it."""
+
 DTYPES = {"float": torch.float32, "double": torch.float64, "int64_t": torch.int64, "uint8_t": torch.bool}
 """Of tables, by their type in C."""
 
-DONE, NO_MEMORY = 0, 1
-"""What the compiled frame returns: see csrc/plan.h."""
+LETTERS = {"float": b"f", "double": b"d", "int64_t": b"i", "uint8_t": b"b", "i": b"i", "d": b"d"}
+"""What a record says of its values."""
+
+FLOAT_PLANES = 2
+"""VTS_FLOAT of csrc/torchvts.h."""
+
+DONE, NO_MEMORY, BAD_ARGUMENT, BAD_VALUES = range(4)
+"""What vts_depth() returns."""
+
+
+class PlanError(ValueError):
+    """Bytes that the library refuses, with its reason."""
+
+
+class Facts(ctypes.Structure):
+    """vts_facts of csrc/torchvts.h."""
+
+    _fields_ = (
+        ("mm_per_pixel", ctypes.c_double),
+        ("height", ctypes.c_int32),
+        ("width", ctypes.c_int32),
+        ("metric", ctypes.c_int32),
+        ("about_size", ctypes.c_int32),
+        ("about", ctypes.c_void_p),
+        ("bytes", ctypes.c_void_p),
+        ("size", ctypes.c_size_t),
+    )
 
 
 @functools.cache
-def fields() -> dict[str, str]:
-    """Kind of each field of a plan, by name, in order: "i", "d", or the type of a table."""
+def fields() -> dict[str, tuple[str, str]]:
+    """Of each field of a plan, by name, in order: its kind ("i", "d", or the type of a table), and how many values it has."""
     lines = loaded().plan_fields().decode().split("\n")[:-1]
-    return {name: kind for kind, name in (line.rsplit(" ", 1) for line in lines)}
+    return {name: (kind, size) for kind, name, size in (line.split(" ", 2) for line in lines)}
 
 
-@functools.cache
-def _structure() -> type[ctypes.Structure]:
-    kinds = {"i": ctypes.c_int64, "d": ctypes.c_double}
-    members = [(name, kinds.get(kind, ctypes.c_void_p)) for name, kind in fields().items()]
-    made = type("Plan", (ctypes.Structure,), {"_fields_": members})
-    assert ctypes.sizeof(made) == loaded().plan_size(), "the library has another layout than it says"
-    return made
-
-
-class Plan:
-    """A plan in memory, with the tables that it points to. Nothing changes it.
+def plan_bytes(values: Mapping[str, Any], about: Mapping[str, object]) -> bytes:
+    """The file of a plan.
 
     Args:
         values: of every field; None for no table.
+        about: who made it and of what, for JSON.
     Raises:
         TypeError: a table of another dtype. KeyError, ValueError: fields that are missing, or too many.
     """
+    unknown = values.keys() - fields().keys()
+    if unknown:
+        raise ValueError(f"values: expected fields of a plan, got {', '.join(sorted(unknown))}")
+    text = json.dumps(about, sort_keys=True, allow_nan=False).encode() + b"\0"
+    parts = [_whole_lines(text)]
+    for name, (kind, _) in fields().items():
+        content, count = _content(name, kind, values[name])
+        parts += [struct.pack("<32sc7xQ16x", name.encode(), LETTERS[kind], count), _whole_lines(content)]
+    size = LINE + sum(map(len, parts))
+    rest = b"".join([struct.pack("<QII32x", size, len(fields()), len(text)), *parts])
+    return struct.pack("<8sII", b"VTSPLAN\n", VERSION, zlib.crc32(rest)) + rest
 
-    def __init__(self, values: Mapping[str, Any]) -> None:
-        self._kept: list[object] = []
-        unknown = values.keys() - fields().keys()
-        if unknown:
-            raise ValueError(f"values: expected fields of a plan, got {', '.join(sorted(unknown))}")
-        given = {name: self._given(name, kind, values[name]) for name, kind in fields().items()}
-        self._memory = _structure()(**given)
-        self.address = ctypes.addressof(self._memory)
 
-    def _given(self, name: str, kind: str, value: Any) -> Any:
-        if kind in ("i", "d"):
-            return int(value) if kind == "i" else float(value)
-        if value is None:
-            return None
-        if not isinstance(value, Tensor) or value.dtype != DTYPES[kind] or not value.is_cpu:
-            raise TypeError(f"{name}: expected a tensor of {DTYPES[kind]} on the CPU, got {value!r:.100}")
-        table = value.detach().contiguous().clone()
-        self._kept.append(table)
-        return table.data_ptr()
+def _content(name: str, kind: str, value: Any) -> tuple[bytes, int]:
+    if kind in ("i", "d"):
+        return (struct.pack("<q", int(value)) if kind == "i" else struct.pack("<d", float(value))), 1
+    if value is None:
+        return b"", 0
+    if not isinstance(value, Tensor) or value.dtype != DTYPES[kind] or not value.is_cpu:
+        raise TypeError(f"{name}: expected a tensor of {DTYPES[kind]} on the CPU, got {value!r:.100}")
+    return value.detach().contiguous().numpy().tobytes(), value.numel()
 
-    def reconstruct(self, image: Tensor, conditions: Tensor, output: tuple[Tensor, ...]) -> None:
-        """Reconstruct a frame.
+
+def _whole_lines(content: bytes) -> bytes:
+    return content + bytes(-len(content) % LINE)
+
+
+class Plan:
+    """A plan in the memory of the library, which read and checked it. Nothing changes it.
+
+    Args:
+        content: bytes of the file, which the library copies.
+    Attributes:
+        about: who made it and of what, as the file says.
+        size: of its images, pixels.
+        mm_per_pixel: pixel pitch.
+        metric: whether lengths are mm.
+    Raises:
+        PlanError: what is wrong with it, and what to do.
+    """
+
+    def __init__(self, content: bytes) -> None:
+        reason = ctypes.create_string_buffer(256)
+        self._handle = loaded().vts_load(content, len(content), reason)
+        if not self._handle:
+            raise PlanError(reason.value.decode())
+        weakref.finalize(self, loaded().vts_free, self._handle)
+        facts = self._facts()
+        self.size, self.mm_per_pixel, self.metric = (facts.height, facts.width), facts.mm_per_pixel, bool(facts.metric)
+        try:
+            about = json.loads(ctypes.string_at(facts.about, facts.about_size))
+        except (ValueError, RecursionError) as error:
+            raise PlanError(f"about: expected JSON, got {error}") from error
+        if not isinstance(about, dict):
+            raise PlanError(f"about: expected an object in JSON, got {about!r:.60}")
+        self.about: dict[str, object] = about
+
+    def _facts(self) -> Facts:
+        facts = Facts()
+        loaded().vts_info(self._handle, ctypes.addressof(facts))
+        return facts
+
+    def content(self) -> bytes:
+        """The bytes of the file."""
+        facts = self._facts()
+        return ctypes.string_at(facts.bytes, facts.size)
+
+    def reconstruct(self, image: Tensor, conditions: Tensor, output: tuple[Tensor, ...]) -> bool:
+        """Reconstruct a frame; False if its values are not finite and in [0, 1].
 
         Args:
             image: (3, H, W), its markers filled, contiguous float32 as all tensors here but for masks.
@@ -74,23 +147,8 @@ class Plan:
         Raises:
             MemoryError: memory is short.
         """
-        parts = [part.data_ptr() for part in output]
-        code = int(loaded().reconstruct(self.address, image.data_ptr(), conditions.data_ptr(), *parts))
+        depth, gradient, normal, contact, deformed = (part.data_ptr() for part in output)
+        wanted = (ctypes.c_void_p * 6)(depth, normal, contact, deformed, gradient, conditions.data_ptr())  # vts_output
+        code = int(loaded().vts_depth(self._handle, image.data_ptr(), FLOAT_PLANES, wanted))
         check_memory(code == NO_MEMORY)
-
-
-def ends(values: Tensor) -> tuple[float, float]:
-    """Smallest and largest of some contiguous values of float32; NaN where any is no number or infinite."""
-    found = (ctypes.c_float * 2)()
-    loaded().range(values.data_ptr(), values.numel(), found)
-    return found[0], found[1]
-
-
-def poisson_tables(height: int, width: int) -> Tensor | None:
-    """Tables of csrc/poisson.c for a size; None where the height has a prime factor that is too large."""
-    size = loaded().poisson_plan_size(height)
-    if not size or width < 2:
-        return None
-    tables = torch.empty(-(-size // 8), dtype=torch.float64, device="cpu")
-    loaded().make_poisson_plan(height, width, tables.data_ptr())
-    return tables
+        return code == DONE

@@ -1,7 +1,9 @@
 """A pipeline that cannot change: a frame in one call of compiled code, or, where that is not possible, in PyTorch."""
 
 import copy
+import platform
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -9,9 +11,11 @@ from torch import Tensor, nn
 from torch.autograd import forward_ad
 
 from ..compensate import Compensate
-from ..compiled import NotCompiled, Plan, check_block, ends, library, why_no_library
+from ..compiled import NotCompiled, Plan, PlanError, check_block, library, plan_bytes, why_no_library
 from ..compiled import blocks as compiled
-from ..core.checks import check_batch, check_range, check_record, check_same_size, in_range
+from ..core import __version__
+from ..core.checks import check_batch, check_path, check_range, check_record, check_same_size
+from ..core.files import MOST_TENSOR_BYTES, write_atomically
 from ..core.frame import Conditions, DepthOutput
 from .depth import DepthPipeline
 from .refine import Refine, SlopesOfDepth, SlopesOfPixels
@@ -42,16 +46,15 @@ class FrozenPipeline:
         ValueError: parameters that record gradients. TypeError: no pipeline.
     """
 
-    __slots__ = ("_before", "_pipe", "_plan", "_size", "compiled", "mm_per_pixel", "mode", "not_compiled")
+    __slots__ = ("_before", "_pipe", "_plan", "compiled", "mm_per_pixel", "mode", "not_compiled")
 
     compiled: bool
     not_compiled: str
     mode: str
     mm_per_pixel: float
-    _pipe: DepthPipeline
+    _pipe: DepthPipeline | None
     _plan: Plan | None
     _before: nn.Sequential
-    _size: tuple[int, int]
 
     def __init__(self, pipe: DepthPipeline) -> None:
         check_record("pipe", pipe, DepthPipeline, "DepthPipeline.from_calibration makes one")
@@ -63,27 +66,83 @@ class FrozenPipeline:
                 )
         with torch.inference_mode(False), torch.device("cpu"):  # whatever the defaults are
             own = copy.deepcopy(pipe).eval()
-            plan, reason, size = None, "", (0, 0)
+            plan, reason = None, ""
             try:
-                plan, size = plan_of(own)
-            except NotCompiled as error:
+                plan = Plan(plan_bytes(values_of(own), about(own)))
+            except (NotCompiled, PlanError) as error:
                 reason = str(error)
         before: list[nn.Module] = []
         if plan is not None and isinstance(own.compensate, Compensate):
             steps = own.compensate.linear
             before = list(steps[:-1] if compiled.ends_in_gamma(steps) else steps)
+        self._hold(own, plan, before, reason, own.mode, own.mm_per_pixel)
+
+    def _hold(
+        self, pipe: DepthPipeline | None, plan: Plan | None, before: list[nn.Module], reason: str, mode: str, mm_per_pixel: float
+    ) -> None:
         given: dict[str, object] = {
-            "_pipe": own,
+            "_pipe": pipe,
             "_plan": plan,
             "_before": nn.Sequential(*before),
-            "_size": size,
             "compiled": plan is not None,
             "not_compiled": reason,
-            "mode": own.mode,
-            "mm_per_pixel": own.mm_per_pixel,
+            "mode": mode,
+            "mm_per_pixel": mm_per_pixel,
         }
         for name, value in given.items():
             object.__setattr__(self, name, value)
+
+    def save(self, path: str | Path) -> None:
+        """Write the plan: one file that Python, C, robots and web pages read, see docs/plan.md; whole or not at all.
+
+        Raises:
+            ValueError: what is not compiled, or printed markers, which PyTorch fills.
+            OSError: it cannot be written there.
+        """
+        if self._plan is None:
+            why = f"got one in PyTorch, because {self.not_compiled}"
+            raise ValueError(f"pipe: expected one that is compiled, {why}: torchvts.export writes others")
+        if len(self._before):
+            raise ValueError(
+                "pipe: expected a skin without printed markers, got one whose markers PyTorch fills before the compiled code: "
+                "torchvts.export.export_torchscript writes a file that holds them"
+            )
+        with write_atomically(path) as temporary:
+            temporary.write_bytes(self._plan.content())
+
+    @classmethod
+    def load(cls, path: str | Path) -> "FrozenPipeline":
+        """Read a plan that :meth:`save` wrote.
+
+        Raises:
+            FileNotFoundError: no such file.
+            ValueError: no plan, of another version, or damaged; names the file.
+            RuntimeError: there is no compiled library, which a plan needs.
+        Example:
+            >>> from torchvts import Calibration, PointLights, Sensor
+            >>> lights = PointLights([[20, 0, 30], [-10, 17, 30], [-10, -17, 30]], [900, 900, 900])
+            >>> cal = Calibration.from_lights(lights, Sensor("rig", 48, 64, 0.5))
+            >>> DepthPipeline.from_calibration(cal).freeze().save("unit.plan")  # doctest: +SKIP
+            >>> FrozenPipeline.load("unit.plan")  # doctest: +SKIP
+            FrozenPipeline(mode=fast, mm_per_pixel=0.5, compiled)
+        """
+        path = check_path("path", path)
+        if not path.is_file():
+            raise FileNotFoundError(f"{path}: no such file")
+        if (size := path.stat().st_size) > MOST_TENSOR_BYTES:
+            raise ValueError(f"{path}: expected a plan of at most {MOST_TENSOR_BYTES} bytes, got {size}: another file?")
+        if library() is None:
+            raise RuntimeError(f"{path}: a plan needs the compiled library, and there is none: {why_no_library()}")
+        try:
+            return cls._of(path.read_bytes())
+        except PlanError as error:
+            raise ValueError(f"{path}: {error}") from error
+
+    @classmethod
+    def _of(cls, content: bytes) -> "FrozenPipeline":
+        plan, found = Plan(content), cls.__new__(cls)
+        found._hold(None, plan, [], "", str(plan.about.get("mode", "unknown")), plan.mm_per_pixel)
+        return found
 
     def __setattr__(self, name: str, value: object) -> None:
         raise AttributeError(f"{name}: a frozen pipeline cannot change: change the pipeline, or make another, and freeze that")
@@ -92,6 +151,9 @@ class FrozenPipeline:
         return self
 
     def __reduce__(self) -> tuple[Any, ...]:
+        if self._pipe is None:
+            assert self._plan is not None
+            return FrozenPipeline._of, (self._plan.content(),)
         return FrozenPipeline, (self._pipe,)
 
     def __repr__(self) -> str:
@@ -119,13 +181,16 @@ class FrozenPipeline:
         self._check(images)
         if self._plan is None:
             images = images.clone(memory_format=torch.contiguous_format)
+            assert self._pipe is not None
             with torch.inference_mode():
                 seen = self._pipe.conditions(images)
             return self._in_pytorch(images), Conditions(*(part.clone() for part in seen))
         with torch.inference_mode():
             images = images.resolve_neg().contiguous()
-            filled = self._before(images).contiguous()
-        count, size = images.shape[0], self._size
+            if len(self._before):
+                check_range("images", images)
+                images = self._before(images).contiguous()
+        count, size = images.shape[0], self._plan.size
         kinds = (torch.float32, torch.float32, torch.float32, torch.bool, torch.bool)
         parts = [torch.empty(count, c, *size, dtype=kind, device="cpu") for c, kind in zip(SHAPES, kinds, strict=True)]
         conditions = torch.empty(count, 22, dtype=torch.float32, device="cpu")
@@ -133,25 +198,25 @@ class FrozenPipeline:
         frames = range(count)
         if threads <= 1:
             for k in frames:
-                self._frame(k, images, filled, parts, conditions)
+                self._frame(k, images, parts, conditions)
         else:
             pool = ThreadPoolExecutor(threads, thread_name_prefix="torchvts")
             try:  # each thread holds what it works on, so that nothing is freed under it
-                list(pool.map(lambda k: self._frame(k, images, filled, parts, conditions), frames))
+                list(pool.map(lambda k: self._frame(k, images, parts, conditions), frames))
             finally:
                 _finish(pool)
         unseen = torch.rad2deg(torch.atan(conditions[:, 21]))
         return DepthOutput(*parts), Conditions(conditions[:, :18].reshape(count, 3, 6), conditions[:, 18:21], unseen)
 
-    def _frame(self, k: int, images: Tensor, filled: Tensor, parts: list[Tensor], conditions: Tensor) -> None:
-        """Check one frame of a batch, and write its output."""
+    def _frame(self, k: int, images: Tensor, parts: list[Tensor], conditions: Tensor) -> None:
+        """Write the output of one frame of a batch, or raise if its values are not those of an image."""
         assert self._plan is not None
-        if not in_range(*ends(images[k])):
+        if not self._plan.reconstruct(images[k], conditions[k], tuple(part[k] for part in parts)):
             check_range("images", images)
-        self._plan.reconstruct(filled[k], conditions[k], tuple(part[k] for part in parts))
 
     def _in_pytorch(self, images: Tensor) -> DepthOutput:
         images = images.clone(memory_format=torch.contiguous_format)  # rounding depends on the layout
+        assert self._pipe is not None
         with torch.inference_mode():
             output = self._pipe(images)
         # copies made outside of inference mode can be used wherever the user wants
@@ -167,7 +232,7 @@ class FrozenPipeline:
             return
         if images.dtype != torch.float32 or not images.is_cpu:
             raise TypeError(f"images: expected torch.float32 on the CPU, got {images.dtype} on {images.device}: use .float().cpu()")
-        check_same_size("images", images, "the calibration", *self._size)
+        check_same_size("images", images, "the calibration", *self._plan.size)
 
 
 def _finish(pool: ThreadPoolExecutor) -> None:
@@ -179,8 +244,14 @@ def _finish(pool: ThreadPoolExecutor) -> None:
         raise
 
 
-def plan_of(pipe: DepthPipeline) -> tuple[Plan, tuple[int, int]]:
-    """The plan of a pipeline, and the size of its images.
+def about(pipe: DepthPipeline) -> dict[str, object]:
+    """What a plan says of itself, for people."""
+    made_by = f"torchvts {__version__} on {platform.system()} {platform.machine()}"
+    return {"unit": pipe._unit, "metric": pipe._metric, "length": "mm", "mode": pipe.mode, "made_by": made_by}
+
+
+def values_of(pipe: DepthPipeline) -> dict[str, Any]:
+    """The fields of a pipeline's plan.
 
     Raises:
         NotCompiled: what has no compiled form.
@@ -198,6 +269,7 @@ def plan_of(pipe: DepthPipeline) -> tuple[Plan, tuple[int, int]]:
     if values["mm_per_pixel"] is None:  # a response field by itself has none
         values["mm_per_pixel"] = pipe.mm_per_pixel
     compiled.check_equal("normals.mm_per_pixel", values["mm_per_pixel"], pipe.mm_per_pixel)
+    values["metric"] = pipe._metric
     values |= compiled.compensate_values(pipe.compensate, size)
     values |= compiled.solver_values("integrate", solve.integrate, values)
     values |= compiled.mask_values(pipe.mask, size, pipe.takes_slopes)
@@ -210,4 +282,4 @@ def plan_of(pipe: DepthPipeline) -> tuple[Plan, tuple[int, int]]:
     if pipe.refine.solve is not solve:
         raise NotCompiled("refine.solve is not that of the pipeline")
     values["passes"] = pipe.refine.passes
-    return Plan(values), size
+    return values

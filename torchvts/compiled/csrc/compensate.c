@@ -1,8 +1,6 @@
 /* From a camera's image to the compensated image: torchvts/compensate, which explains it. */
 #include "plan.h"
 
-#include <stdlib.h>
-
 /* Camera values in [0, 1] to linear light, by a table between whose entries light is a line. */
 WIDE void linearise(const Plan *plan, const float *image, float *light) {
     const size_t n = 3 * (size_t)plan->height * plan->width;
@@ -105,12 +103,13 @@ static void blur_lines(const Affine *plane, const float *weight, int taps, int h
     }
 }
 
-int blur_plane(const float *plane, const float *weight, int taps, int height, int width, float *out) {
+int blur_plane(Scratch *scratch, const float *plane, const float *weight, int taps, int height, int width, float *out) {
     const Affine affine = {.image = plane};
-    const float **line = malloc(sizeof(float *) * (size_t)taps + sizeof(float) * ((size_t)taps * width + width + taps));
+    const size_t before = scratch->used;
+    const float **line = lend(scratch, sizeof(float *) * (size_t)taps + sizeof(float) * ((size_t)taps * width + width + taps));
     if (!line) return NO_MEMORY;
     blur_lines(&affine, weight, taps, height, width, (float *)(line + taps), line, out);
-    free(line);
+    give_back(scratch, before);
     return DONE;
 }
 
@@ -178,14 +177,15 @@ static WIDE void relight(const Plan *plan, const float *image, const float *back
     }
 }
 
-int compensate(const Plan *plan, const float *image, float *terms, float *light) {
+int compensate(const Plan *plan, Scratch *scratch, const float *image, float *terms, float *light) {
     const int taps = (int)plan->blur_taps, height = (int)plan->height, width = (int)plan->width;
     const size_t pixels = (size_t)height * width, lines = (size_t)taps * width + width + taps, filled = taps && plan->defects ? pixels : 0;
     const size_t lit = plan->relights ? pixels : 0;
-    const float **line = malloc(sizeof(float *) * (size_t)(taps + 1) + sizeof(float) * (lines + lit + filled + (size_t)plan->defects + 1));
+    const size_t before = scratch->used;
+    const float **line = lend(scratch, sizeof(float *) * (size_t)(taps + 1) + sizeof(float) * (lines + lit + filled + (size_t)plan->defects + 1));
     if (!line) return NO_MEMORY;
     float *rows = (float *)(line + taps + 1), *relit = rows + lines, *whole = relit + lit, *repaired = whole + filled;
-    const int code = plan->relights ? frame_light(plan, image, terms) : DONE;
+    const int code = plan->relights ? frame_light(plan, scratch, image, terms) : DONE;
     for (int c = 0; c < 3 && code == DONE; c++, image += pixels, light += pixels) {
         const size_t at = pixels * (size_t)c;
         if (lit) relight(plan, image, plan->background + at, terms + 6 * c, relit);
@@ -198,6 +198,6 @@ int compensate(const Plan *plan, const float *image, float *terms, float *light)
         }
         if (taps) blur_lines(&affine, plan->blur, taps, height, width, rows, line, light);
     }
-    free(line);
+    give_back(scratch, before);
     return code;
 }

@@ -1,29 +1,17 @@
 /* A frame, from the image to depth, slopes, normals and masks: DepthPipeline of torchvts/pipeline/depth.py in one straight line. */
 #include "plan.h"
 
-#include <stdlib.h>
-
-#define TEXT(x) #x
-#define INTEGER_TEXT(name) "i " #name "\n"
-#define REAL_TEXT(name) "d " #name "\n"
-#define TABLE_TEXT(type, name) TEXT(type) " " #name "\n"
-
-/* A line for each field of Plan, in their order: its kind (i int64, d double, else the type of a table) and its name. */
-EXPORT const char *plan_fields(void) { return ALL_FIELDS(INTEGER_TEXT, REAL_TEXT, TABLE_TEXT); }
-
-EXPORT int64_t plan_size(void) { return (int64_t)sizeof(Plan); }
-
 /* Smallest and largest of n values; NaN where any is none. */
-EXPORT WIDE void range(const float *values, int64_t n, float *ends) {
+WIDE void range(const float *values, size_t n, float *ends) {
     float low[16], high[16], none[16];
     for (int k = 0; k < 16; k++) low[k] = high[k] = values[0], none[k] = 0.0f;
-    for (int64_t at = 0; at + 16 <= n; at += 16)
+    for (size_t at = 0; at + 16 <= n; at += 16)
         for (int k = 0; k < 16; k++) {
             const float value = values[at + k];
             low[k] = value < low[k] ? value : low[k], high[k] = value > high[k] ? value : high[k];
             none[k] += 0.0f * value;
         }
-    for (int64_t at = n - n % 16; at < n; at++)
+    for (size_t at = n - n % 16; at < n; at++)
         low[0] = fminf(low[0], values[at]), high[0] = fmaxf(high[0], values[at]), none[0] += 0.0f * values[at];
     for (int k = 1; k < 16; k++) low[0] = fminf(low[0], low[k]), high[0] = fmaxf(high[0], high[k]), none[0] += none[k];
     ends[0] = low[0] + none[0], ends[1] = high[0] + none[0];
@@ -46,18 +34,18 @@ static void solve_slopes(const Plan *plan, Frame *frame, const float *depth, flo
 }
 
 /* Eq. 4: weighted slopes to depth from the undeformed skin. */
-static int solve_depth(const Plan *plan, const Frame *frame, float *gradient, float *depth) {
+static int solve_depth(const Plan *plan, Scratch *scratch, const Frame *frame, float *gradient, float *depth) {
     times_weight(frame->slopes, frame->weight, (size_t)plan->height * plan->width, gradient);
-    const int code = integrate(plan, gradient, depth);
-    return code == DONE ? zero_background(plan, frame->weight, depth) : code;
+    const int code = integrate(plan, scratch, gradient, depth);
+    return code == DONE ? zero_background(plan, scratch, frame->weight, depth) : code;
 }
 
 /* Eq. 10: solves again with the depth found, in place. */
-static int refine(const Plan *plan, Frame *frame, float *gradient, float *normal, float *depth) {
+static int refine(const Plan *plan, Scratch *scratch, Frame *frame, float *gradient, float *normal, float *depth) {
     int code = DONE;
     for (int pass = 1; code == DONE && pass < plan->passes; pass++) {
         solve_slopes(plan, frame, depth, normal);
-        code = solve_depth(plan, frame, gradient, depth);
+        code = solve_depth(plan, scratch, frame, gradient, depth);
     }
     return code;
 }
@@ -98,38 +86,36 @@ static int any_weight(const float *weight, size_t n) {
 }
 
 /* From the image to slopes and weight; conditions: the light (3, 6), what is lost (3), the slope that could not be seen. */
-static int begin(const Plan *plan, const float *image, Frame *frame, float *normal, float *conditions) {
+static int begin(const Plan *plan, Scratch *scratch, const float *image, Frame *frame, float *normal, float *conditions) {
     for (int k = 0; k < 22; k++) conditions[k] = k < 18 && k % 6 == 0;
     if (plan->light_of) linearise(plan, image, normal), image = normal;
-    const int code = compensate(plan, image, conditions, frame->light);
+    const int code = compensate(plan, scratch, image, conditions, frame->light);
     if (code != DONE) return code;
     solve_slopes(plan, frame, NULL, normal);
-    return weigh(plan, frame->light, frame->slopes, conditions + 21, frame->weight);
+    return weigh(plan, scratch, frame->light, frame->slopes, conditions + 21, frame->weight);
 }
 
-/*
- * A frame. image (3, H, W), as the camera gives it but for its markers; conditions (22), see begin(); depth (1, H, W), gradient (2, H, W), normal (3, H, W), contact and deformed
- * (1, H, W) bytes. Returns DONE or NO_MEMORY.
- */
-EXPORT int reconstruct(const Plan *plan, const float *image, float *conditions, float *depth, float *gradient, float *normal, uint8_t *contact,
-                       uint8_t *deformed) {
-    const size_t pixels = (size_t)plan->height * plan->width;
-    float *memory = malloc(6 * sizeof(float) * pixels);
+/* A frame. image (3, H, W), as the camera gives it but for its markers; conditions (22), see begin(); depth (1, H, W), gradient (2, H, W), normal
+   (3, H, W), contact and deformed (1, H, W) bytes. Returns DONE or NO_MEMORY. */
+int reconstruct(const Plan *plan, Scratch *scratch, const float *image, float *conditions, float *depth, float *gradient, float *normal,
+                uint8_t *contact, uint8_t *deformed) {
+    const size_t pixels = (size_t)plan->height * plan->width, before = scratch->used;
+    float *memory = lend(scratch, 6 * sizeof(float) * pixels);
     if (!memory) return NO_MEMORY;
     Frame frame = {memory, memory + 3 * pixels, memory + 4 * pixels};
-    int code = begin(plan, image, &frame, normal, conditions);
+    int code = begin(plan, scratch, image, &frame, normal, conditions);
     if (code == DONE && !any_weight(frame.weight, pixels)) {
         undeformed(pixels, depth, gradient, normal, contact, deformed);
     } else {
-        if (code == DONE) code = solve_depth(plan, &frame, gradient, depth);
-        if (code == DONE) code = refine(plan, &frame, gradient, normal, depth);
+        if (code == DONE) code = solve_depth(plan, scratch, &frame, gradient, depth);
+        if (code == DONE) code = refine(plan, scratch, &frame, gradient, normal, depth);
         if (code == DONE) {
             find_moved(plan, frame.weight, depth, deformed);
-            code = find_contact(plan, depth, deformed, contact);
+            code = find_contact(plan, scratch, depth, deformed, contact);
             if (plan->slopes_of_depth) slopes_of_depth(depth, (int)plan->height, (int)plan->width, (float)(0.5 / plan->mm_per_pixel), gradient);
             normals_of_slopes(gradient, pixels, normal);
         }
     }
-    free(memory);
+    give_back(scratch, before);
     return code;
 }

@@ -1,8 +1,6 @@
 /* The light of a frame over that of the background: Relight of torchvts/compensate/light.py, which explains it. */
 #include "plan.h"
 
-#include <stdlib.h>
-
 enum { TERMS = 6, FORMS = TERMS * (TERMS + 1) / 2, LANES = 8 };
 
 /* LANES values that one instruction works on, which may lie anywhere in memory. Of this type, all sums below stay in registers. */
@@ -216,14 +214,16 @@ static void find_terms(const Plan *plan, const Samples *some, const int known[3]
     }
 }
 
-int frame_light(const Plan *plan, const float *image, float *terms) {
+int frame_light(const Plan *plan, Scratch *scratch, const float *image, float *terms) {
     const int n = (int)plan->relight_padded;
-    double *memory = calloc(13 * (size_t)n, sizeof(double));
+    const size_t before = scratch->used, bytes = 13 * sizeof(double) * (size_t)n;
+    double *memory = lend(scratch, bytes);
     if (!memory) return NO_MEMORY;
+    memset(memory, 0, bytes);
     Samples some = {memory, memory + 3 * (size_t)n, memory + 6 * (size_t)n, plan->relight_share, n, (int)(plan->relight_rows * plan->relight_columns)};
     int known[3];
     take(plan, image, &some, terms + 3 * TERMS, known);
     find_terms(plan, &some, known, memory + 9 * (size_t)n, terms);
-    free(memory);
+    give_back(scratch, before);
     return DONE;
 }

@@ -6,8 +6,6 @@
 #include "cosine.h"
 #include "plan.h"
 
-#include <stdlib.h>
-
 static const double PI = 3.14159265358979323846;
 
 /* Coefficients from 0 on that depth gets wave by wave: they are nearly all of it, and a transform rounds them at each of its steps. */
@@ -32,13 +30,13 @@ static int wide_of(int height) { return (height + SLICE - 1) / SLICE * SLICE; }
 static inline size_t place_of(size_t k, size_t x, size_t columns) { return (k / SLICE * columns + x) * SLICE + k % SLICE; }
 
 /* Bytes of the tables; 0 where the height has a prime factor that is too large. */
-EXPORT int64_t poisson_plan_size(int height) {
+size_t poisson_size(int height) {
     int radix[MOST_PASSES];
     if (height < 2 || !cosine_radices(height, radix)) return 0;
-    return (int64_t)(sizeof(double) * 4 * (size_t)wide_of(height) + sizeof(float) * (WAVES * (size_t)height + cosine_table_size(height)));
+    return sizeof(double) * 4 * (size_t)wide_of(height) + sizeof(float) * (WAVES * (size_t)height + cosine_table_size(height));
 }
 
-EXPORT void make_poisson_plan(int height, int width, double *tables) {
+void make_poisson(int height, int width, double *tables) {
     const int wide = wide_of(height);
     memset(tables, 0, sizeof(double) * 4 * (size_t)wide); /* the constant, k = 0, is solved by itself */
     for (int k = 1; k < height; k++) {
@@ -277,19 +275,21 @@ static void solve_one(const Solver *of, const float *gradient, float half_pitch,
     for (int y = 0; y < height; y++) row_of_depth(cosine_line(&of->cosine, at.lines, y), step, width, depth + (size_t)y * width);
 }
 
-int integrate(const Plan *plan, const float *gradient, float *depth) {
+int integrate(const Plan *plan, Scratch *shared, const float *gradient, float *depth) {
     const int height = (int)plan->height, width = (int)plan->width;
     const Solver of = solver_of(height, width, plan->poisson);
     const size_t wide = (size_t)of.wide, columns = (size_t)width + LINES, pixels = (size_t)height * width;
     const size_t coefficients = columns * wide, lines = columns * (size_t)height, scratch = cosine_scratch_size(height);
-    double *memory = calloc(1, sizeof(double) * (size_t)width + sizeof(float) * (coefficients + lines + scratch + wide * LINES));
+    const size_t taken = shared->used, bytes = sizeof(double) * (size_t)width + sizeof(float) * (coefficients + lines + scratch + wide * LINES);
+    double *memory = lend(shared, bytes);
     if (!memory) return NO_MEMORY;
+    memset(memory, 0, bytes);
     float *floats = (float *)(memory + width);
     const Memory at = {memory, floats, floats + coefficients, floats + coefficients + lines, floats + coefficients + lines + scratch};
     const unsigned int before = without_tiny();
     solve_one(&of, gradient, 0.5f * (float)plan->mm_per_pixel, at, depth);
     with_tiny(before);
     if (plan->zeroed) lower(depth, level_of(gradient, depth, height, width), pixels);
-    free(memory);
+    give_back(shared, taken);
     return DONE;
 }

@@ -1,8 +1,6 @@
 /* Where the object touches the skin: moved() of torchvts/skin/weight.py and ContactFromDepth of torchvts/skin/pressure.py, which explain it. */
 #include "plan.h"
 
-#include <stdlib.h>
-
 static WIDE float largest(const float *values, size_t n, int absolute) {
     float most[16], found;
     for (int k = 0; k < 16; k++) most[k] = absolute ? 0.0f : values[0];
@@ -135,21 +133,22 @@ static WIDE void mark(const uint8_t *restrict deformed, const float *restrict fo
     for (size_t k = 0; k < n; k++) contact[k] = deformed[k] & (uint8_t)(found[k] > 0.0f);
 }
 
-int find_contact(const Plan *plan, const float *depth, const uint8_t *deformed, uint8_t *contact) {
+int find_contact(const Plan *plan, Scratch *scratch, const float *depth, const uint8_t *deformed, uint8_t *contact) {
     const int height = (int)plan->height, width = (int)plan->width, cell = (int)plan->contact_cell, reach = (int)plan->rim_reach;
     const int rows = height / cell, columns = width / cell;
     const size_t n = (size_t)rows * columns, pixels = (size_t)height * width;
-    float *pressure = malloc(sizeof(float) * (6 * n + 2 * (size_t)reach * (columns + 1) + (size_t)columns + (size_t)width + cell + pixels));
+    const size_t before = scratch->used;
+    float *pressure = lend(scratch, sizeof(float) * (6 * n + 2 * (size_t)reach * (columns + 1) + (size_t)columns + (size_t)width + cell + pixels));
     if (!pressure) return NO_MEMORY;
     float *blurred = pressure + n, *cells = blurred + n, *some = cells + n, *image = some + 3 * n + 2 * (size_t)reach * (columns + 1) + columns;
     if (cell > 1) cell_means(depth, width, cell, rows, columns, image, cells), depth = cells;
-    const int code = blur_plane(depth, plan->contact_blur, (int)plan->contact_taps, rows, columns, blurred);
+    const int code = blur_plane(scratch, depth, plan->contact_blur, (int)plan->contact_taps, rows, columns, blurred);
     if (code == DONE) {
         curvature_of(blurred, (float)plan->curvature_scale, rows, columns, pressure);
         above(plan, blurred, pressure, rows, columns, some);
         if (cell > 1) to_pixels(pressure, rows, columns, cell, height, width, some, image);
         mark(deformed, cell > 1 ? image : pressure, pixels, contact);
     }
-    free(pressure);
+    give_back(scratch, before);
     return code;
 }

@@ -48,15 +48,15 @@ typedef void (*row_of)(const float *, size_t, const float *, const float *, cons
             sines(image, step, place, weight, 0, 0, 0.0f, 0.0f, degree, products, cubes, n, sine_x, sine_y);                                          \
     }
 
-#define ROWS(name, products, cubes)      \
+#define ROW_LOOPS(name, products, cubes)      \
     ROW(name##_2, 2, products, cubes)    \
     ROW(name##_4, 4, products, cubes)    \
     ROW(name##_6, 6, products, cubes)
 
-ROWS(linear, 0, 0)
-ROWS(with_products, PRODUCTS, 0)
-ROWS(with_cubes, 0, CUBES)
-ROWS(with_both, PRODUCTS, CUBES)
+ROW_LOOPS(linear, 0, 0)
+ROW_LOOPS(with_products, PRODUCTS, 0)
+ROW_LOOPS(with_cubes, 0, CUBES)
+ROW_LOOPS(with_both, PRODUCTS, CUBES)
 
 /* By products, 1, and cubes, 2; then by half the degree. */
 static const row_of ALL_ROWS[4][3] = {{linear_2, linear_4, linear_6},

@@ -1,8 +1,6 @@
 /* How surely the skin has moved: ContactMask of torchvts/skin/weight.py, which explains it. */
 #include "plan.h"
 
-#include <stdlib.h>
-
 /* Sums of each `cell` values of a line. */
 static WIDE void sum_cells(const float *restrict line, int cell, int columns, float *restrict sums) {
     for (int j = 0; j < columns; j++) sums[j] = line[(size_t)j * cell];
@@ -164,10 +162,11 @@ static WIDE void rise(const Plan *plan, const float *evidence, int rows, int col
     around(weight, rows, columns, 1, some, wide);
 }
 
-int weigh(const Plan *plan, const float *light, const float *gradient, float *unseen, float *weight) {
+int weigh(const Plan *plan, Scratch *scratch, const float *light, const float *gradient, float *unseen, float *weight) {
     const int height = (int)plan->height, width = (int)plan->width, cell = (int)plan->mask_cell;
     const int rows = height / cell, columns = width / cell, n = rows * columns;
-    float *change = malloc(sizeof(float) * (8 * (size_t)n + (size_t)width + (size_t)columns + (size_t)cell) + (sizeof(int32_t) + 1) * (size_t)n);
+    const size_t before = scratch->used;
+    float *change = lend(scratch, sizeof(float) * (8 * (size_t)n + (size_t)width + (size_t)columns + (size_t)cell) + (sizeof(int32_t) + 1) * (size_t)n);
     if (!change) return NO_MEMORY;
     float *grey = change + 3 * (size_t)n, *some = grey + n, *evidence = some + 2 * (size_t)n, *other = evidence + n, *line = other + n;
     int32_t *stack = (int32_t *)(line + width + columns + cell);
@@ -184,11 +183,11 @@ int weigh(const Plan *plan, const float *light, const float *gradient, float *un
         for (int k = 0; k < n; k++) evidence[k] = plan->by_colour ? fminf(evidence[k], other[k]) : other[k];
     }
     for (int k = 0; k < n; k++) evidence[k] *= plan->mask_noise[k];
-    code = blur_plane(evidence, plan->mask_blur, (int)plan->mask_taps, rows, columns, other);
+    code = blur_plane(scratch, evidence, plan->mask_blur, (int)plan->mask_taps, rows, columns, other);
     if (code == DONE) {
         rise(plan, other, rows, columns, change, change + n, some, kept, stack, evidence);
         to_pixels(evidence, rows, columns, cell, height, width, line, weight);
     }
-    free(change);
+    give_back(scratch, before);
     return code;
 }

@@ -1,8 +1,6 @@
 /* Depth counted from the undeformed skin: ZeroBackground of torchvts/skin/zero.py, which explains it. In double precision. */
 #include "plan.h"
 
-#include <stdlib.h>
-
 /* Grids of cells and sums of one frame. */
 typedef struct {
     int rows, columns, n, pairs_y, pairs_x, unknowns;
@@ -221,12 +219,13 @@ static WIDE FUSED void add_offset(const Plan *plan, const double *found, float *
     }
 }
 
-int zero_background(const Plan *plan, const float *weight, float *depth) {
+int zero_background(const Plan *plan, Scratch *scratch, const float *weight, float *depth) {
     const int cell = (int)plan->zero_cell, rows = (int)plan->height / cell, columns = (int)plan->width / cell;
     const int ky = (int)plan->waves_y, kx = (int)plan->waves_x, n = rows * columns, unknowns = ky * kx;
     const size_t pairs = (size_t)(ky * (ky + 1) / 2) * (kx * (kx + 1) / 2);
     const size_t size = 8 * (size_t)n + (size_t)plan->width + (size_t)(ky * (ky + 1) / 2) * columns + 2 * pairs + (size_t)unknowns * (unknowns + 2) + (size_t)plan->width + (size_t)kx;
-    double *memory = malloc(sizeof(double) * size);
+    const size_t before = scratch->used;
+    double *memory = lend(scratch, sizeof(double) * size);
     if (!memory) return NO_MEMORY;
     Work at = {rows, columns, n, ky * (ky + 1) / 2, kx * (kx + 1) / 2, unknowns, memory, memory + n, memory + 2 * n, memory + 3 * n,
                memory + 4 * n, memory + 5 * n, memory + 6 * n, memory + 8 * n, NULL, NULL, NULL, NULL, NULL, NULL};
@@ -243,6 +242,6 @@ int zero_background(const Plan *plan, const float *weight, float *depth) {
     if (any_free) fit_offset(plan, &at, reach);
     float *line = (float *)(at.found + unknowns);
     add_offset(plan, at.found, line, line + kx, depth);
-    free(memory);
+    give_back(scratch, before);
     return DONE;
 }

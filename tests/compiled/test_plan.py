@@ -175,6 +175,50 @@ def check_fuzz(saved, fuzz):
     assert wrong == 0 and read + refused == DAMAGES and read > DAMAGES // 20 and refused > DAMAGES // 2
 
 
+# ---- the example in C++ ----
+
+EXAMPLE = ROOT / "examples" / "cpp"
+
+
+@pytest.fixture(scope="module")
+def program(tmp_path_factory):
+    """The program of examples/cpp, by CMake, or where there is none, by the system's compilers."""
+    if shutil.which("c++") is None:
+        pytest.skip("no C++ compiler")
+    folder = tmp_path_factory.mktemp("build")
+    if shutil.which("cmake"):
+        for command in (["cmake", "-S", str(EXAMPLE), "-B", str(folder)], ["cmake", "--build", str(folder)]):
+            subprocess.run(command, check=True, capture_output=True)
+        return folder / "depth"
+    sources = [str(path) for path in sorted(CSRC.glob("*.c")) if path.name != "sources.c"]
+    subprocess.run(["cc", "-std=c11", "-O1", "-w", "-DWIDE=", "-ffp-contract=off", "-c", *sources], check=True, cwd=folder)
+    objects = [str(path) for path in folder.glob("*.o")]
+    command = ["c++", "-std=c++17", "-I", str(CSRC), str(EXAMPLE / "depth.cpp"), *objects, "-lm", "-o", str(folder / "depth")]
+    subprocess.run(command, check=True)
+    return folder / "depth"
+
+
+def test_the_example_in_cpp_gives_the_depth_of_python(saved, program, tmp_path):
+    path, frozen, images = saved
+    pixels = (images[0] * 255.0).round().to(torch.uint8).permute(1, 2, 0).contiguous().numpy()
+    (tmp_path / "image.ppm").write_bytes(b"P6\n32 24\n255\n" + pixels.tobytes())
+
+    def run(*words):
+        return subprocess.run([str(program), *map(str, words)], capture_output=True, text=True)
+
+    deepest = float(frozen(images[:1]).depth_mm.max())
+    assert deepest > 0.1
+    assert run(path, tmp_path / "image.ppm").stdout == f"deepest {deepest:.3f} mm\n"
+    for words, reason in (
+        ((path,), "expected a plan and an image"),
+        ((tmp_path / "none.plan", tmp_path / "image.ppm"), "none.plan: no such file"),
+        ((tmp_path / "image.ppm", tmp_path / "image.ppm"), "image.ppm: not a plan"),
+        ((path, path), "unit.plan: "),
+    ):
+        done = run(*words)
+        assert done.returncode == 1 and reason in done.stderr
+
+
 # ---- the page ----
 
 PAGE = (ROOT / "docs" / "plan.md").read_text()

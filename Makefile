@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: setup demo test test-coverage test-long test-wheel check bench docs clean
+.PHONY: setup demo test test-coverage test-long test-wheel check bench docs wasm web clean
 
 setup: $(VENV)/.done
 
@@ -59,6 +59,29 @@ bench: setup
 # The documentation as HTML in out/docs, from docs/ and the docstrings; a warning is an error.
 docs: setup
 	$(BIN)/python -m sphinx --fail-on-warning --keep-going --quiet docs out/docs
+
+# The compiled frame for browsers and Node, out/web/torchvts.wasm, by zig of PyPI in an environment of its own; ZIG=zig takes another.
+WASM := out/web/torchvts.wasm
+CSRC := torchvts/compiled/csrc
+ZIG ?= out/zig/bin/python -m ziglang
+
+wasm: $(WASM)
+
+out/zig:
+	$(PYTHON) -m venv $@
+	$@/bin/pip install --quiet --disable-pip-version-check "ziglang>=0.15" || (rm -rf $@; exit 1)
+
+$(WASM): $(wildcard $(CSRC)/*.[ch]) $(if $(filter out/zig%,$(ZIG)),| out/zig)
+	mkdir -p $(@D)
+	$(ZIG) cc -target wasm32-wasi -msimd128 -mexec-model=reactor -std=c11 -O3 -fno-math-errno -fno-strict-aliasing -ffp-contract=off \
+		-fvisibility=hidden $(filter-out %/sources.c %/track.c %/grids.c,$(wildcard $(CSRC)/*.c)) -o $@ \
+		-Wl,--export=malloc -Wl,--export=free -Wl,--export-dynamic -Wl,--strip-all
+
+# The page, in out/web: the folder web/, the library, and a drawn press with its plan. Any server of files shows it, such as
+# python -m http.server --directory out/web
+web: setup $(WASM)
+	cp web/* out/web
+	$(BIN)/python scripts/web_demo.py --out out/web
 
 clean:
 	rm -rf $(VENV) out .mypy_cache .ruff_cache .pytest_cache

@@ -1,9 +1,10 @@
 """Live depth of a camera; where none is named, a drawn film of a ball that is pressed in and released stands in for it.
 
     python examples/camera.py
-    python examples/camera.py 0
+    python examples/camera.py 0 unit.safetensors
 
-The number of a camera, the path of a video, or the URL of a network camera. The first frames must be without contact.
+The second: the number of a camera, the path of a video, or the URL of a network camera, and what ``torchvts calibrate`` wrote for
+this unit. The first frames must be without contact. The film goes to out/film.
 """
 
 import sys
@@ -14,7 +15,7 @@ import torch
 import torchvts as vts
 from torchvts import scenes
 
-sensor = vts.Sensor("rig", height=120, width=160, mm_per_pixel=0.1)  # of a real camera: its sensor, and its calibration
+sensor = vts.Sensor("rig", height=120, width=160, mm_per_pixel=0.1)  # of the drawn film
 lights = vts.PointLights([[12, 3, 15], [-9, 8, 15], [-3, -12, 15]], [150, 150, 150])
 calibration = vts.Calibration.from_lights(lights, sensor)
 
@@ -31,9 +32,13 @@ def draw_film(folder: Path) -> Path:
     return folder
 
 
+if len(sys.argv) == 2:
+    sys.exit("expected a source and the calibration of its unit: python examples/camera.py 0 unit.safetensors")
 source = sys.argv[1] if len(sys.argv) > 1 else draw_film(Path("out/film"))
+if len(sys.argv) > 1:
+    calibration = vts.Calibration.load(sys.argv[2])
 deepest_mm = []
 with vts.stream.TactileStream(source, calibration, mode="fast") as stream:
     for number, _, _, out in stream:
         deepest_mm.append(float(out.depth_mm.max()))
-        print(f"frame {number}: deepest {deepest_mm[-1]:.3f} mm {stream.doubt}")
+        print(f"frame {number}: deepest {deepest_mm[-1]:.3f} mm" + (f"; in doubt: {stream.doubt}" if stream.doubt else ""))

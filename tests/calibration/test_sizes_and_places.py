@@ -59,7 +59,7 @@ def test_what_nothing_could_check_is_said_and_no_warning():
     assert (
         not warned
         and unit.metric
-        and said.startswith("not checked: without a prior the images say nothing of the size of all balls")
+        and said.startswith("not checked: the scale rests on the diameters and the mm_per_pixel that were given")
     )
     assert float(re.search(r"up to ([\d.]+); an object of known height", said)[1]) > 1.2 * UNIT.sensor.mm_per_pixel
 

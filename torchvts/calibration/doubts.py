@@ -219,13 +219,13 @@ def not_checked(contacts: Sequence[Contact], sensor: Sensor, width: Width) -> Do
             "would check it"
         )
     most = f"{sensor.mm_per_pixel / width.times:.3g}" if width.times else ""
-    limit = f", and no contact is wider than its ball with an mm_per_pixel up to {most}" if most else ""
+    limit = f" (an mm_per_pixel up to {most} would fit the contacts)" if most else ""
     alone = [contact.name for contact in used(contacts) if SURE * contact.metrics.get("gain_std", math.inf) > WRONG_BALL]
     named = ", ".join(alone[:3]) + (f" and {len(alone) - 3} more" if len(alone) > 3 else "")
     return Doubt(
-        f"{NOT_CHECKED}: without a prior the images say nothing of the size of all balls, or of mm_per_pixel: scale rests on what "
-        f"was given{limit}; an object of known height would check it"
-        + (f"; a diameter wrong by half would not show in {named}: press beside it, or measure these balls again" if alone else "")
+        f"{NOT_CHECKED}: the scale rests on the diameters and the mm_per_pixel that were given{limit}: without a prior no image "
+        "shows whether they are right; press an object of known height to check them"
+        + (f"; a diameter wrong by half would not show in {named}: press the same ball beside it" if alone else "")
     )
 
 

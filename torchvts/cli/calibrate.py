@@ -62,7 +62,7 @@ def run(arguments: argparse.Namespace) -> int:
     presses += read_press_images(arguments.press, sensor)
     calibration = calibrated(image, sensor, presses, arguments.force)
     calibration.save(arguments.out)
-    picture = arguments.out.with_suffix(".png")
+    picture = arguments.out.with_name(f"{arguments.out.stem}_calibration.png")  # not the name of a background
     save_figure(calibration_figure(calibration, check_presses(presses, sensor)), picture)
     print(summary_of(calibration, arguments.candidates))
     print(f"wrote {arguments.out} ({arguments.out.stat().st_size / 1000:.0f} kB), and {picture}: what it was made of")

@@ -183,7 +183,7 @@ def _unusable(e: Examination) -> Finding | None:
 
 
 def _failed(e: Examination) -> Figures:
-    rough = "with two LEDs left modes precise and auto still find a rough depth, with one none does"
+    rough = "with two LEDs left mode precise still finds a rough depth, with one none does"
     left = "the response of this unit needs all of them" if e.unit.lights is None else rough
     return {"value": float(len(e.failed)), "colors": " and ".join(CHANNELS[j] for j in e.failed), "left": left}
 
@@ -439,6 +439,6 @@ CHECKS = (
           "less, or raise the LEDs", lambda figures: "warning" if figures["value"] > 0.3 else "note", above=0.01),
     Check("cast_shadow", _cast_shadow, "a shadow falls on {value:.1%} of the image, on flat skin: modes fast and those of response "
           "fields take it for a slope; use precise mode with known lights, or raise the LEDs", above=0.002),
-    Check("deep_press", _deep_press, "deep press ({deepest:.1f} mm): fast mode is off by {value:.1f} px; use precise or auto",
+    Check("deep_press", _deep_press, "deep press ({deepest:.1f} mm): fast mode is off by {value:.1f} px; use precise",
           "note", above=0.5),
 )  # fmt: skip

@@ -13,8 +13,8 @@ class NormalFromResponse(NormalModel):
     """Unit normals of a compensated image, which for a response field is image / background.
 
     The field's sines are the parts of the normal in the plane of the undeformed skin. In a second pass, what the depth of the
-    first does to brightness is taken out before: what flat skin changes is subtracted, and the rest divided by what slopes gain. The
-    normals of a pipeline are then those of the depth.
+    first does to brightness is taken out before: what flat skin changes is subtracted, and the rest divided by what slopes gain.
+    The normals of a pipeline are then those of the depth.
 
     Args:
         field: sine by brightness.

@@ -75,13 +75,14 @@ class DotTemplates(nn.Module):
         normal = weighed.mT @ columns
         ridge = RIDGE * torch.diag(normal.diagonal(dim1=1, dim2=2).mean(0).clamp_min(1e-12))
         matrix = torch.linalg.solve(normal + ridge, weighed.mT)  # (N, 10, P)
-        # blur makes noise of neighbours alike
+        # unit noise, alike in neighbours by blur, in the shares, and what of it is left in the residual
         apart = torch.cdist(patch, patch).double()
-        alike = torch.exp(-apart.square() / (4.0 * ((blur_px / cell) ** 2 + SPLINE_VARIANCE))) * (noise @ noise.mT)
-        missed = torch.eye(len(patch), dtype=torch.float64) - columns @ matrix
-        residual = torch.einsum("np,npq,npq->n", weight[..., 0].double(), missed @ alike, missed)
+        alike = torch.exp(-apart.square() / (4.0 * ((blur_px / cell) ** 2 + SPLINE_VARIANCE)))
+        shares = ((matrix * noise.mT) @ alike) * noise.mT  # (N, 10, P)
+        covariance = shares @ matrix.mT
+        residual = window.sum() - 2.0 * (shares * weighed.mT).sum((1, 2)) + (normal * covariance).sum((1, 2))
         buffers = {"weight": weight[..., 0], "columns": columns, "matrix": matrix, "unit_residual": residual}
-        for name, value in (buffers | {"unit_covariance": matrix[:, :2] @ alike @ matrix[:, :2].mT}).items():
+        for name, value in (buffers | {"unit_covariance": covariance[:, :2, :2]}).items():
             self.register_buffer(name, value.to(grey.dtype))
 
     def prepare(self, grey: Tensor) -> Tensor:

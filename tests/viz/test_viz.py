@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+import torchvts as vts
 from torchvts import viz
 
 PITCH = 0.1
@@ -83,3 +84,16 @@ def test_a_comparison_names_what_it_compares_and_takes_one_frame():
         viz.comparison_figure(torch.stack((frame(), frame())), frame(), PITCH)
     with pytest.raises(ValueError, match="truth_mm: expected"):
         viz.comparison_figure(frame(), frame()[..., :-1], PITCH)
+
+
+def test_arrows_of_dots_have_their_true_length():
+    skin = vts.scenes.DottedSkin(120, 160, 0.125)
+    drag = vts.scenes.Drag(radius_mm=30.0, shift_mm=(0.3, -0.15))
+    calibration = vts.Calibration.from_lights(skin.lights, vts.Sensor("rig", 120, 160, 0.125), skin.image())
+    moved = vts.SkinMotion.from_calibration(calibration)(skin.image(drag)[None], skin.depth_mm(drag).float())
+    axes = viz.new_figure(3.0, 3.0).subplots()
+    viz.draw_motion(axes, moved)
+    arrows = axes.collections[0]
+    assert len(arrows.U) == int(moved.seen.sum()) > 40
+    assert abs(float(arrows.U.mean()) - 0.3) < 0.02 and abs(float(arrows.V.mean()) + 0.15) < 0.02
+    assert [text.get_text() for text in axes.texts] == ["0.1 mm"]

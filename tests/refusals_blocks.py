@@ -93,6 +93,9 @@ TABLE = {
         "mode": []}, file=("weights", "sensor"), run=False),
     "DepthPipeline.forward": Entry({"images": image()[None]}, {"images": IMAGES}, lambda: pipe()),
     "FrozenPipeline": Entry({"pipe": pipe()}, {"pipe": [None, "pipe.pt", torch.nn.Identity()]}),
+    "FrozenPipeline.load": Entry({"path": ...}, {"path": [*MISSING, ".", 3, None]}, file=("path",), run=False),
+    "FrozenPipeline.save": Entry(
+        {"path": ...}, {"path": [*MISSING, ".", 3, None]}, lambda: pipe().freeze().save, file=("path",), run=False),
     "FrozenPipeline.with_conditions": Entry({"images": image()[None]}, {"images": IMAGES}, lambda: pipe().freeze().with_conditions),
     "FillMarkers": Entry({"diameter_px": 9.0, "contrast": 0.06, "sigmas": 5.0, "margin": 0.2},
         {"diameter_px": ["9", None, NAN, -1], "contrast": NUMBER, "sigmas": NUMBER, "margin": NUMBER}),

@@ -14,7 +14,7 @@ from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 
 from torchvts import viz
-from torchvts.core.files import image_files, read_image
+from torchvts.core.files import IMAGE_SUFFIXES, natural_order, read_image
 from torchvts.model.markers import FillMarkers, find_dots
 from torchvts.scenes import DottedSkin, Drag
 from torchvts.skin import DotMotion, SkinMotion
@@ -430,7 +430,8 @@ def run_real(data: Path, limit: int) -> Iterator[RealRow]:
     for name, (rest, pattern) in REAL.items():
         background = read_image(data / name / rest)
         markers = FillMarkers.from_background(background)
-        files = [file for file in image_files(data / name) if file.name != rest and file.match(pattern)]
+        images = sorted((data / name).glob(pattern), key=lambda file: natural_order(file.name))
+        files = [file for file in images if file.name != rest and file.suffix.lower() in IMAGE_SUFFIXES]
         there = SkinMotion(background, find_dots(background, markers), markers.diameter_px, 1.0, (0.0, 0.0, float("inf")))
         zero = torch.zeros(1, 1, *background.shape[1:])
         seen, largest, back, apart, out, ratio = [], 0.0, [], [], [], []

@@ -71,10 +71,10 @@ def mini_backgrounds(data):
 def test_backgrounds_of_the_type_are_not_named_and_turned_ones_are(data, mini):
     for image in mini_backgrounds(data):
         assert of_type(image, mini) == []
-        assert "it is turned by 180 degrees: " in of_type(image.flip(1, 2), mini)[0].text
-        assert "it is mirrored left to right: " in of_type(image.flip(2), mini)[0].text
-        assert "it is mirrored top to bottom: " in of_type(image.flip(1), mini)[0].text
-        assert "it has its channels swapped to the order B, G, R: " in of_type(image.flip(0), mini)[0].text
+        assert "it is turned by 180 degrees (" in of_type(image.flip(1, 2), mini)[0].text
+        assert "it is mirrored left to right (" in of_type(image.flip(2), mini)[0].text
+        assert "it is mirrored top to bottom (" in of_type(image.flip(1), mini)[0].text
+        assert "it has its channels swapped to the order B, G, R (" in of_type(image.flip(0), mini)[0].text
 
 
 @pytest.mark.parametrize("folder", ["gelsight_pale", "digit_a"])

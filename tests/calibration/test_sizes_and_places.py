@@ -61,7 +61,7 @@ def test_what_nothing_could_check_is_said_and_no_warning():
         and unit.metric
         and said.startswith("not checked: the scale rests on the diameters and the mm_per_pixel that were given")
     )
-    assert float(re.search(r"up to ([\d.]+); an object of known height", said)[1]) > 1.2 * UNIT.sensor.mm_per_pixel
+    assert float(re.search(r"up to ([\d.]+) would fit the contacts", said)[1]) > 1.2 * UNIT.sensor.mm_per_pixel
 
 
 @pytest.mark.parametrize("pitch_off", [0.9, 1.1])

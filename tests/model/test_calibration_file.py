@@ -163,7 +163,7 @@ def test_a_new_file_replaces_the_old_and_keeps_its_mode(calibration, saved):
 def test_known_lights_need_no_image(ring):
     cal = vts.Calibration.from_lights(ring(), SENSOR)
     assert cal.measured is False and float(cal.compensation.abs().max()) == 0 and not bool(cal.defects.any())
-    assert cal.noise_std.tolist() == pytest.approx([1 / 255 / 12**0.5] * 3)
+    assert cal.noise_std.tolist() == pytest.approx([0.003] * 3)
 
 
 def test_the_noise_of_the_background_is_measured(calibration):

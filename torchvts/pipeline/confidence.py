@@ -24,6 +24,7 @@ from ..core.checks import (
     check_same_size,
     check_shape,
     check_switch,
+    check_tensor,
 )
 from ..core.geometry import GradientFromNormal
 from ..core.levels import BLACK, SATURATED
@@ -302,6 +303,8 @@ class Confidence(nn.Module):
         spread = (unseen / self.sure).square() - self.cell_share * noise.flatten(1).median(dim=1).values  # which counts already
         spread = spread.clamp_min(0.0)[:, None, None, None]  # of slopes
         if light is not None:
+            if not torch.jit.is_scripting():
+                check_tensor("light", light)
             if light.shape != (images.shape[0], 3, 6):
                 raise ValueError(f"light: expected ({images.shape[0]}, 3, 6), got {light.shape}: conditions.light of these images")
             uneven = light[:, :, 1:].detach().square().sum(dim=2) / light[:, :, 0].detach().square().clamp_min(1e-6)

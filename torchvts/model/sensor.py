@@ -202,6 +202,10 @@ class Sensor:
         """Linear light = value^exponent: gamma, or 1 where it is left open."""
         return 1.0 if self.gamma is None else self.gamma
 
+    def __hash__(self) -> int:
+        """Of the fields that tell sensors apart: frames are looked up by their sensor, and equality asks the rest."""
+        return hash((self.name, self.height, self.width, self.mm_per_pixel))
+
     @property
     def field_mm(self) -> tuple[float, float]:
         """Height and width of the field of view, mm."""

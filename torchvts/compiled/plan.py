@@ -39,7 +39,7 @@ class PlanError(ValueError):
     """Bytes that the library refuses, with its reason."""
 
 
-class Facts(ctypes.Structure):
+class PlanFacts(ctypes.Structure):
     """vts_facts of csrc/torchvts.h."""
 
     _fields_ = (
@@ -127,8 +127,8 @@ class Plan:
             raise PlanError(f"about: expected an object in JSON, got {about!r:.60}")
         self.about: dict[str, object] = about
 
-    def _facts(self) -> Facts:
-        facts = Facts()
+    def _facts(self) -> PlanFacts:
+        facts = PlanFacts()
         loaded().vts_info(self._handle, ctypes.addressof(facts))
         return facts
 

@@ -202,7 +202,7 @@ def test_bounds_grow_with_slopes_that_the_presses_did_not_show(drawn):
     model = out.factors_deg[:, FACTORS.index("model")][:, None]
     sine = out.normal[:, :2].norm(dim=1, keepdim=True)
     steep, gentle = (sine > 0.5) & out.contact, (sine < 0.2) & out.contact
-    assert float(model[steep].mean()) > 1.1 * float(model[gentle].mean())
+    assert float(model[steep].mean()) > 1.05 * float(model[gentle].mean())
     twice = vts.ConfidentPipeline.from_calibration(dataclasses.replace(calibration, covariance=4.0 * calibration.covariance))(
         frames
     )

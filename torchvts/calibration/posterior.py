@@ -10,11 +10,11 @@ The prior's part falls with n, because presses err alike in what a field cannot 
 family of fields, the largest: what no press shows keeps the prior. The prior is that of all sensors (m = 0) or that of a sensor
 type (the field of its units, and how far units differ from it), and no press at all leaves it as it is.
 
-C says what is not known: with the mean of its blocks of the two slopes, (K, K), which is what is kept, phi' C phi is large where no
-ball was pressed, and for steeper skin than any ball's. With ``own``, the mean error of the field on its own presses, the error of
-normals is expected to be (:func:`torchvts.model.stated_deg`)
+C says what is not known. What is kept is the mean of its blocks of the two slopes, (K, K), divided by sqrt(n), between errors that
+presses have alike and errors that average: phi' C phi is large where no ball was pressed, and for steeper skin than any ball's. With
+``own``, the mean error of the field on its own presses, the error of normals is expected to be (:func:`torchvts.model.stated_deg`)
 
-    sqrt(own^2 (1 + 0.1 phi' C phi) + 1.5^2) degrees.
+    sqrt(own^2 (1 + 0.15 phi' C phi) + 1.5^2) degrees.
 """
 
 import copy
@@ -55,7 +55,7 @@ class Posterior:
     Attributes:
         family: of the field.
         mean: (2, K).
-        covariance: (K, K), mean of those of the two slopes, up to the noise of a press.
+        covariance: (K, K), mean of those of the two slopes, up to the noise of a press, divided by the root of their number.
     """
 
     family: Family
@@ -106,7 +106,7 @@ class Evidence:
         form = torch.diag(precision) + torch.tensordot(weight, self.grams, 1)
         covariance = torch.cholesky_inverse(torch.linalg.cholesky(form))
         mean = covariance @ (precision * prior.mean.reshape(-1) + torch.tensordot(weight, self.rights, 1))
-        both = 0.5 * (covariance[:half, :half] + covariance[half:, half:])
+        both = 0.5 * (covariance[:half, :half] + covariance[half:, half:]) / weight.sum().clamp_min(1.0).sqrt()
         return Posterior(self.family, mean.reshape(2, half), both)
 
     def held_out(self, prior: Prior) -> list[Tensor]:

@@ -396,7 +396,8 @@ def calibration_figure(calibration: Calibration, presses: Sequence[Press]) -> Fi
         image.imshow(_picture(press.image))
         _circle(image, row)
         name = press.name if len(press.name) <= NAME_SHOWN else f"...{press.name[-NAME_SHOWN:]}"
-        image.set_title(name if row["used"] else f"{name}, left out", fontsize=9)
+        counts = "" if row.get("weight", 1.0) > 0.5 else f", counts {row['weight']:.2f}"
+        image.set_title(name + (counts if row["used"] else ", left out"), fontsize=9)
         drawn = left.imshow(off, cmap="cividis", vmin=0.0, vmax=10.0)
         left.set_title(f"normals off the ball's: {np.nanmean(inner):.1f} degrees", fontsize=9)
         _circle(left, row)

@@ -14,6 +14,7 @@ from typing import NamedTuple
 from torch import Tensor
 
 from torchvts import Press, Sensor, calibrate
+from torchvts.calibration.outliers import CORE, DOUBTED
 from torchvts.core.tables import markdown
 
 from . import sets
@@ -34,6 +35,10 @@ NOT_CHECKED = "not checked"
 """How a sentence begins that says what the images cannot show."""
 
 
+LEFT_OUT = (CORE / DOUBTED) ** 4
+"""A press that counts less is counted as left out: it is named."""
+
+
 class Given(NamedTuple):
     """The arguments of a calibration."""
 
@@ -43,7 +48,7 @@ class Given(NamedTuple):
 
 
 class Answer(NamedTuple):
-    """What a calibration says: ``refused`` by which words, or "", and names of the presses that were left out."""
+    """What a calibration says: ``refused`` by which words, or "", and names of the presses that were left out, or count little."""
 
     unit: str
     prior: bool
@@ -85,7 +90,7 @@ def answer(unit: str, mistake: str, given: Given) -> Answer:
             made = calibrate(given.background, given.sensor, presses=given.presses)
         except ValueError as error:
             return Answer(unit, prior, mistake, names, str(error), (), (), False)
-    out = tuple(row["name"] for row in made.report.get("presses", []) if not row["used"])
+    out = tuple(row["name"] for row in made.report.get("presses", []) if not row["used"] or row.get("weight", 1.0) < LEFT_OUT)
     return Answer(unit, prior, mistake, names, "", out, tuple(made.report["doubts"]), made.metric)
 
 

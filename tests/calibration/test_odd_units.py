@@ -231,7 +231,7 @@ def test_presses_that_contradict_the_prior_calibrate_without_it():
     assert all(row["used"] for row in dropped.report["presses"])
     wrong = dataclasses.replace(SENSOR, prior=prior(light))  # its background fits, its slopes have the other sign
     dropped, warned = calibrate(camera(light), wrong, presses(light, turned=True))
-    assert "without the sensor's prior: by the prior only " in dropped.report["reason"]
+    assert "without the sensor's prior: by the prior " in dropped.report["reason"]
 
 
 # refusals that name their cause

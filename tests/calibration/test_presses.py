@@ -490,10 +490,13 @@ REASONS = {
 
 
 @pytest.mark.parametrize("kind", REASONS)
-def test_a_bad_press_is_left_out_with_its_reason(mixed, kind):
+def test_a_bad_press_counts_little_or_nothing_and_says_why(mixed, kind):
     rows, warned, _, _ = mixed
-    assert rows[kind]["used"] is False and re.search(REASONS[kind], rows[kind]["reason"]), rows[kind]
-    assert [text for text in warned if text.startswith(f"{kind}: left out: ")] == [f"{kind}: left out: {rows[kind]['reason']}"]
+    row = rows[kind]
+    assert not row["used"] or row["weight"] < 0.15, row
+    assert re.search(REASONS[kind], row["reason"]), row
+    said = f"{kind}: {'' if row['used'] else 'left out: '}"
+    assert [text for text in warned if text.startswith(said)] == [f"{said}{row['reason']}"]
 
 
 def test_a_wrong_diameter_is_told_with_the_one_seen(mixed):
@@ -510,10 +513,11 @@ def test_good_presses_among_bad_ones_are_used(mixed, good, by_good):
     assert angle < 1.1 * depth_errors(by_good, seen_by_curve, ball, "fast", HELD_OUT)[1]
 
 
-def test_two_wrong_diameters_among_seven_are_left_out(good, rest):
+def test_two_wrong_diameters_among_seven_count_little(good, rest):
     wrong = [dataclasses.replace(p, ball_diameter_mm=12.0) for p in take_presses(count=8)[6:]]
     calibration, _ = calibrate(rest, GIVEN, good[:5] + wrong)
-    assert [row["used"] for row in calibration.report["presses"]] == [True] * 5 + [False] * 2
+    weights = [row["weight"] for row in calibration.report["presses"]]
+    assert min(weights[:5]) > 0.5 and max(weights[5:]) < 0.15
 
 
 @pytest.mark.parametrize("sizes, warned", [((6.0, 6.0), 0), ((4.0, 9.0), 1)])
@@ -540,30 +544,30 @@ def test_lights_on_one_line_show_no_slopes_across_it():
 
 
 @pytest.mark.parametrize("ball_mm", [500.0, pytest.param(60.0, marks=pytest.mark.long)])
-def test_an_absurd_diameter_is_left_out_like_any_other(good, rest, ball_mm):
+def test_an_absurd_diameter_counts_nothing(good, rest, ball_mm):
     calibration, warned = calibrate(rest, GIVEN, [*good, dataclasses.replace(good[0], ball_diameter_mm=ball_mm, name="absurd")])
-    assert len(warned) == 1 and warned[0].startswith("absurd: left out: ") and not calibration.report["presses"][-1]["used"]
+    assert len(warned) == 1 and warned[0].startswith("absurd: ") and calibration.report["presses"][-1].get("weight", 0.0) < 0.01
 
 
 @pytest.mark.parametrize(
     "count, times",
     [
         (3, 1.5),
-        (5, 1 / 1.9),
+        (5, 1 / 1.5),
         *[pytest.param(n, t, marks=pytest.mark.long) for n, t in ((3, 1 / 1.9), (5, 1.5), (9, 1.5), (9, 1 / 1.5))],
     ],
 )
-def test_one_wrong_diameter_costs_no_good_press_and_moves_no_ball(rest, count, times):
+def test_one_wrong_diameter_costs_no_good_press_and_hardly_moves_a_ball(rest, count, times):
     presses = take_presses(count=10)
     kept, odd = presses[:count], dataclasses.replace(presses[9], ball_diameter_mm=times * BALL_MM, name="odd")
     alone, _ = calibrate(rest, GIVEN, kept)
     calibration, warned = calibrate(rest, GIVEN, [*kept[:2], odd, *kept[2:]])
     rows = {row["name"]: row for row in calibration.report["presses"]}
-    assert [name for name, row in rows.items() if not row["used"]] == ["odd"]
-    assert [text for text in warned if text.startswith("odd: left out: by the other ")]
+    assert [name for name, row in rows.items() if row["weight"] < 0.5] == ["odd"] and rows["odd"]["weight"] < 0.1
+    assert [text for text in warned if text.startswith("odd: counts 0.0") and "of a press: by the other " in text]
     assert calibration.metric and not calibration.report["not_metric"]  # the warning is no reason to doubt the depth
     for row in alone.report["presses"]:
-        assert rows[row["name"]]["center_px"] == pytest.approx(row["center_px"], abs=1e-9)
+        assert rows[row["name"]]["center_px"] == pytest.approx(row["center_px"], abs=0.5)
 
 
 def test_a_prior_sees_which_of_three_diameters_is_wrong(prior):
@@ -571,7 +575,8 @@ def test_a_prior_sees_which_of_three_diameters_is_wrong(prior):
     presses = other_presses(3)
     presses[1] = dataclasses.replace(presses[1], ball_diameter_mm=1.5 * presses[1].ball_diameter_mm)
     calibration, _ = calibrate(background(seen_by_other_curve), sensor, presses)
-    assert [row["used"] for row in calibration.report["presses"]] == [True, False, True]
+    right, wrong, other = (row["weight"] for row in calibration.report["presses"])
+    assert wrong < 0.2 and min(right, other) > 0.9
 
 
 def test_only_bad_presses_are_an_error_that_names_each(rest):
@@ -581,11 +586,11 @@ def test_only_bad_presses_are_an_error_that_names_each(rest):
             call()
 
 
-def test_two_presses_that_contradict_each_other_are_an_error(good, rest):
-    wrong = dataclasses.replace(good[4], ball_diameter_mm=2 * BALL_MM)
-    with pytest.raises(ValueError, match=r"^presses: none can be used: press 0: .*; press 4: .*") as caught:
-        vts.calibrate(rest, GIVEN, [good[0], wrong])
-    assert "one of the two diameters is wrong" in str(caught.value)
+@pytest.mark.parametrize("times", [0.5, 1.5, 2.0])
+def test_two_presses_that_contradict_each_other_are_not_metric(good, rest, times):
+    wrong = dataclasses.replace(good[4], ball_diameter_mm=times * BALL_MM)
+    unit, _ = calibrate(rest, GIVEN, [good[0], wrong])
+    assert not unit.metric and any("by each other the balls seem" in doubt for doubt in unit.report["not_metric"])
 
 
 BAD_IMAGES = {

@@ -16,13 +16,13 @@ from .contacts import Contact, NoUsablePress, used
 from .doubts import SURE, Doubt, not_checked, of_fitted_lights, of_presses, of_sizes, of_type, too_wide, width_of
 from .field import Family
 from .given_images import colourless
-from .posterior import Evidence, prior_of
+from .posterior import Evidence, prior_of, weights_of
 from .press_model import by_presses
 from .presses import Press
 from .touching import with_contact
 
-LEAST_USED = 0.5
-"""Share of the presses that a prior must be able to use."""
+LEAST_USED = 0.25
+"""Share of the presses that must count by a prior, else it is of another type: all are two standard deviations off it."""
 
 
 class Given(NamedTuple):
@@ -142,11 +142,13 @@ def _fitted(given: Given) -> tuple[Made, list[Contact]]:
         contacts = error.contacts
     sizes = [] if strange else of_sizes(contacts, sensor.mm_per_pixel)
     first = None if on_prior is None else Made(on_prior, strange + sizes, "presses on the prior")
-    left, count = len(used(contacts)), len(contacts)
+    left, count = float(weights_of(used(contacts)).sum()), len(contacts)
     contradiction = "the background does not have its pattern of light" if strange else ""
     if not contradiction and left < LEAST_USED * count:
         reasons = "; ".join(f"{contact.name}: {contact.reason}" for contact in contacts if contact.reason)
-        contradiction = f"by the prior only {left} of {count} presses can be used ({reasons})"
+        contradiction = f"by the prior only {left:.1f} of {count} presses can be used" + (f" ({reasons})" if reasons else "")
+    if not contradiction and sizes:
+        contradiction = "by the prior all sizes are wrong"
     if first is not None and not contradiction:
         return first, contacts
     try:
@@ -166,7 +168,7 @@ def _fitted(given: Given) -> tuple[Made, list[Contact]]:
 
 def _better(second: Calibration, first: Calibration) -> bool:
     """Whether the fit without a prior is to be taken."""
-    more, fewer = (sum(row["used"] for row in unit.report["presses"]) for unit in (second, first))
+    more, fewer = (sum(row.get("weight", 1.0) for row in unit.report["presses"] if row["used"]) for unit in (second, first))
     if fewer < LEAST_USED * more or more < LEAST_USED * fewer:
         return more > fewer
     error, by_prior = second.report["held_out_deg"], first.report["held_out_deg"]

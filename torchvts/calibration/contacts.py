@@ -64,6 +64,8 @@ class Contact:
         uneven: unevenness of the image's light beside the background's.
         known: the center was given and is not searched.
         radius_known: the contact radius was given and is not searched.
+        weight: how much of a press it counts, by what the others expect of it.
+        doubt: why that is little, else empty.
         reason: why the contact is left out; empty if it is used.
         metrics: "error_deg" and "gain" of the report.
     """
@@ -83,6 +85,8 @@ class Contact:
     uneven: float = 0.0
     known: bool = False
     radius_known: bool = False
+    weight: float = 1.0
+    doubt: str = ""
     reason: str = ""
     metrics: dict[str, float] = field(default_factory=dict)
 
@@ -245,9 +249,10 @@ def first_pass_depths(contacts: Sequence[Contact], response: ResponseField, pitc
 
 def press_row(contact: Contact, sensor: Sensor) -> PressRow:
     """The row of a press in the report."""
-    row: PressRow = {"name": contact.name, "used": not contact.reason, "reason": contact.reason}
+    row: PressRow = {"name": contact.name, "used": not contact.reason, "reason": contact.reason or contact.doubt}
     if "error_deg" in contact.metrics:
         row["error_deg"], row["gain"] = contact.metrics["error_deg"], contact.metrics["gain"]
+        row["weight"] = contact.weight
     if "gain_std" in contact.metrics:
         row["gain_std"] = contact.metrics["gain_std"]
     if contact.contact_radius_mm > 0:

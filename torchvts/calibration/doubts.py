@@ -36,9 +36,11 @@ WIDTH_ERROR = 0.05
 WRONG_BALL = 0.5
 """Part by which the diameter of one ball is wrong that the others should show: a radius for a diameter."""
 
-MANY, DISAGREEING = 6, 1.8
-"""From so many presses, and so many standard deviations of their gains about the median (RMS), presses disagree with each other:
-sets of right presses of ten real and eight drawn sensors have at most 1.64, with two balls exchanged or doubled 1.6 to 4.3."""
+MOST_DOUBTED = 1 / 3
+"""Share of presses that may each contradict all others: more of them contradict each other."""
+
+DISAGREEING = 4.0
+"""So many standard deviations of a mean square about the usual one, which is sqrt(2 / N) of N presses, and presses disagree."""
 
 RIM_SINE = 0.7
 """Part of a ball's sine that is left at the rim of its contact: about the middle of its fall."""
@@ -88,6 +90,7 @@ def of_presses(contacts: Sequence[Contact], field: ResponseField, pitch_mm: floa
     uneven = statistics.median(contact.uneven for contact in contacts)
     other = [Doubt(_other_light(uneven), True)] if uneven > UNEVEN else []
     found = other + [Doubt(f"{contact.name}: left out: {contact.reason}") for contact in contacts if contact.reason]
+    found += [Doubt(f"{contact.name}: {contact.doubt}") for contact in good if contact.doubt]
     found += _sizes_by_each_other(good) + _directions(field, good)
     return [*found, Doubt(too_wide(width, pitch_mm), True)] if width.times > 1.0 - width.std else found
 
@@ -129,13 +132,14 @@ def _std_by_prior(count: int) -> float:
 
 def _sizes_by_each_other(good: Sequence[Contact]) -> list[Doubt]:
     """Presses that contradict each other all over, so that none stands out: sizes exchanged, or one size given for two."""
-    known = [contact.metrics for contact in good if "gain_std" in contact.metrics]
-    if len(known) < MANY:
+    known = [contact for contact in good if "gain_std" in contact.metrics]
+    if not known:
         return []
-    logs = [math.log(max(metrics["gain"], 1e-3)) for metrics in known]
+    logs = [math.log(max(contact.metrics["gain"], 1e-3)) for contact in known]
     middle = statistics.median(logs)
-    apart = math.sqrt(statistics.mean(((log - middle) / one["gain_std"]) ** 2 for log, one in zip(logs, known, strict=True)))
-    if apart < DISAGREEING:
+    squares = [((log - middle) / one.metrics["gain_std"]) ** 2 for log, one in zip(logs, known, strict=True) if not one.doubt]
+    few_doubted = len(known) - len(squares) <= MOST_DOUBTED * len(known)
+    if few_doubted and statistics.mean(squares) < 1.0 + DISAGREEING * math.sqrt(2.0 / len(squares)):
         return []
     return [
         Doubt(

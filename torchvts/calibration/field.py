@@ -163,8 +163,9 @@ def seen_slopes(field: ResponseField, contacts: Sequence[Contact]) -> Tensor:
     for contact in contacts:
         inside = contact.inside()
         ball = contact.ball_slope()[:, inside]
-        found += ContactForms(family, contact).slope(coefficient)[:, inside] @ ball.t() / max(1, int(inside.sum()))
-        given += ball @ ball.t() / max(1, int(inside.sum()))
+        share = contact.weight / max(1, int(inside.sum()))
+        found += share * ContactForms(family, contact).slope(coefficient)[:, inside] @ ball.t()
+        given += share * ball @ ball.t()
     seen: Tensor = found @ torch.linalg.pinv(given)
     return seen
 
@@ -208,9 +209,9 @@ def solve_with_centers(forms: list[ContactForms], penalty: Tensor, anchors: list
     right = torch.zeros(size + 2 * count, dtype=torch.float64)
     for k, item in enumerate(forms):
         form, ball = item.ball()
-        matrix[:size, :size] += form
-        right[:size] += ball
-        coupling, weight, own = item.center()
+        matrix[:size, :size] += item.contact.weight * form
+        right[:size] += item.contact.weight * ball
+        coupling, weight, own = (item.contact.weight * part for part in item.center())
         for axis in range(2):
             part, place = slice(axis * half, (axis + 1) * half), size + 2 * k + axis
             matrix[part, place] += coupling

@@ -11,13 +11,13 @@ family of fields, the largest: what no press shows keeps the prior. The prior is
 type (the field of its units, and how far units differ from it), and no press at all leaves it as it is.
 
 C says what is not known. What is kept is the mean of its blocks of the two slopes, (K, K), divided by sqrt(n), between errors that
-presses have alike and errors that average: phi' C phi is large where no ball was pressed, and for steeper skin than any ball's. With
-``own``, the mean error of the field on its own presses, the error of normals is expected to be (:func:`torchvts.model.stated_deg`)
+presses have alike and errors that average: phi' C phi is large where no ball was pressed, and for steeper skin than any ball's.
+With ``own``, the mean error of the field on its own presses, the error of normals is expected to be
+(:func:`torchvts.model.stated_deg`)
 
     sqrt(own^2 (1 + 0.15 phi' C phi) + 1.5^2) degrees.
 """
 
-import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -81,7 +81,7 @@ def prior_of(family: Family, contacts: Sequence[Contact], of_type: SensorPrior |
         contacts: of the presses; that of all sensors takes the strength of their changes.
         of_type: the sensor's prior, or None.
     """
-    count = max(1, len(contacts))
+    count = max(1.0, float(weights_of(contacts).sum()))
     if of_type is None:
         return Prior(torch.zeros(2, family.size(), dtype=torch.float64), ALL_SENSORS / count * family.penalty(power_of(contacts)))
     mean = of_type.response.field.embedded(family.degree, family.product_degree, family.cubic_degree).tensor()
@@ -89,7 +89,11 @@ def prior_of(family: Family, contacts: Sequence[Contact], of_type: SensorPrior |
 
 
 class Evidence:
-    """What located presses say of a family's coefficients, together and without one."""
+    """What located presses say of a family's coefficients, together and without one.
+
+    Attributes:
+        weights: (N,), how much of a press each counts.
+    """
 
     def __init__(self, family: Family, contacts: Sequence[Contact]) -> None:
         self.family = family
@@ -98,10 +102,11 @@ class Evidence:
         size = 2 * family.size()
         self.grams = torch.stack([gram for gram, _ in each]) if each else torch.zeros(0, size, size, dtype=torch.float64)
         self.rights = torch.stack([right for _, right in each]) if each else torch.zeros(0, size, dtype=torch.float64)
+        self.weights = weights_of(contacts)
 
     def posterior(self, prior: Prior, weights: Tensor | None = None) -> Posterior:
-        """Mean and covariance by all presses, or by ``weights`` (N,) of them."""
-        weight = torch.ones(len(self.forms), dtype=torch.float64) if weights is None else weights
+        """Mean and covariance by all presses with their weights, or with other ``weights`` (N,)."""
+        weight = self.weights if weights is None else weights
         half, precision = self.family.size(), prior.precision.repeat(2)
         form = torch.diag(precision) + torch.tensordot(weight, self.grams, 1)
         covariance = torch.cholesky_inverse(torch.linalg.cholesky(form))
@@ -111,15 +116,8 @@ class Evidence:
 
     def held_out(self, prior: Prior) -> list[Tensor]:
         """For each press the coefficients (2, K) by all others."""
-        others = 1.0 - torch.eye(len(self.forms), dtype=torch.float64)
+        others = self.weights * (1.0 - torch.eye(len(self.forms), dtype=torch.float64))
         return [self.posterior(prior, weights).mean for weights in others]
-
-    def without(self, place: int) -> "Evidence":
-        """The same without one press."""
-        kept = [k for k in range(len(self.forms)) if k != place]
-        rest = copy.copy(self)
-        rest.forms, rest.grams, rest.rights = [self.forms[k] for k in kept], self.grams[kept], self.rights[kept]
-        return rest
 
     def errors_deg(self, coefficients: Sequence[Tensor]) -> list[float]:
         """For each press the mean angle under its coefficients (2, K), degrees."""
@@ -129,6 +127,11 @@ class Evidence:
         """(N,): for each press the slopes by its coefficients divided by the ball's."""
         gains = [item.gain(coefficient) for item, coefficient in zip(self.forms, coefficients, strict=True)]
         return torch.tensor(gains, dtype=torch.float64)
+
+
+def weights_of(contacts: Sequence[Contact]) -> Tensor:
+    """(N,): how much of a press each counts."""
+    return torch.tensor([contact.weight for contact in contacts], dtype=torch.float64)
 
 
 def mean_error_deg(field: ResponseField, contacts: Sequence[Contact]) -> float:

@@ -19,7 +19,7 @@ from ..model.sensor import Sensor
 from ..model.stated_error import stated_deg, variance_of
 from .contacts import Contact, NoUsablePress, first_pass_depths
 from .field import Family, ball_sine
-from .outliers import locate_and_screen
+from .outliers import locate_and_weigh
 from .posterior import Evidence, Posterior, largest, prior_of
 
 FEW = 3
@@ -78,7 +78,7 @@ def fit_response(contacts: list[Contact], sensor: Sensor, prior: SensorPrior | N
     half_mm = 0.5 * sensor.width * pitch if prior is None else prior.response.field.half_mm
     with tqdm(total=3, desc="calibrating from presses", disable=not progress or None, leave=False) as bar:
         bar.set_postfix(step="balls")
-        presses = locate_and_screen(contacts, sensor, prior, half_mm)
+        presses = locate_and_weigh(contacts, sensor, prior, half_mm)
         if not presses:
             raise NoUsablePress(contacts)
         bar.update()
@@ -86,8 +86,10 @@ def fit_response(contacts: list[Contact], sensor: Sensor, prior: SensorPrior | N
         evidence = Evidence(largest(half_mm), presses)
         before = prior_of(evidence.family, presses, prior)
         found = evidence.posterior(before)
-        own_deg = _mean(evidence.errors_deg([found.mean] * len(presses)))
-        held_out_deg = None if len(presses) < FEW else _mean(evidence.errors_deg(evidence.held_out(before)))
+        own_deg = _mean(evidence.errors_deg([found.mean] * len(presses)), evidence.weights)
+        held_out_deg = None
+        if len(presses) >= FEW:
+            held_out_deg = _mean(evidence.errors_deg(evidence.held_out(before)), evidence.weights)
         bar.update()
         bar.set_postfix(step="depth")
         by_depth = fit_depth_brightness(presses, found.field, pitch, None if prior is None else prior.response.by_depth)
@@ -97,8 +99,8 @@ def fit_response(contacts: list[Contact], sensor: Sensor, prior: SensorPrior | N
     return ResponseFit(model, found.covariance, own_deg, held_out_deg, stated)
 
 
-def _mean(errors_deg: Sequence[float]) -> float:
-    return sum(errors_deg) / len(errors_deg)
+def _mean(errors_deg: Sequence[float], weights: Tensor) -> float:
+    return float((torch.tensor(errors_deg, dtype=torch.float64) * weights).sum() / weights.sum())
 
 
 def _stated_anywhere(found: Posterior, contacts: Sequence[Contact], own_deg: float) -> float:
@@ -140,8 +142,8 @@ def fit_depth_brightness(
         inside = contact.inside()
         effect, left = _effect_of_depth(contact, field, depth, start)
         columns = effect[:, :, inside].reshape(3 * size, -1)
-        form += columns @ columns.t() / int(inside.sum())
-        right += columns @ left[:, inside].reshape(-1) / int(inside.sum())
+        form += contact.weight * columns @ columns.t() / int(inside.sum())
+        right += contact.weight * columns @ left[:, inside].reshape(-1) / int(inside.sum())
     found = start + torch.linalg.solve(form, right).reshape(3, size)
     steeper = STEEPER / float(contacts[0].half_size_mm.max())
     rows = tuple(tuple(row) for row in found.tolist())

@@ -46,11 +46,12 @@ class PressRow(_PressKeys, total=False):
     Attributes:
         name: of the press.
         used: whether the fit used it.
-        reason: why it was left out, else "".
+        reason: why it was left out, or counts little, else "".
         center_px: (x, y) of the ball.
         contact_radius_px: radius of the contact.
         error_deg: mean angle between the ball's normals and those of the prior, or of the other presses, degrees.
         gain: slopes of the prior, or of the other presses, divided by the ball's slopes.
+        weight: how much of a press it counts, by how far the gain is off.
         gain_std: standard deviation of that, as far as the other presses know the place; absent where a prior is compared.
     """
 
@@ -59,6 +60,7 @@ class PressRow(_PressKeys, total=False):
     contact_radius_px: float
     error_deg: float
     gain: float
+    weight: float
     gain_std: float
 
 

@@ -47,8 +47,8 @@ def stated_deg(own_deg: float, variance: Tensor, not_learned: float = NOT_LEARNE
     """Mean error of normals to expect, degrees: sqrt(own^2 (1 + 0.15 phi' C phi) + 1.5^2).
 
     The two numbers are the same for all sensors. They were chosen on the 16 sensors on which it lies within a factor of 1.5 of the
-    error on presses that were not learned in 85 % without a prior (too good by more in 6 %) and in 98 % with one (1 %): on others it
-    may be less right.
+    error on presses that were not learned in 85 % without a prior (too good by more in 6 %) and in 98 % with one (1 %): on others
+    it may be less right.
 
     Args:
         own_deg: mean error of the field on its own presses, degrees.

@@ -124,7 +124,7 @@ def _presses(presses: list[PressRow]) -> list[str]:
         center = ", ".join(f"{v:.1f}" for v in press["center_px"]) if "center_px" in press else ""
         wide = 1.0 / max(press["gain"], 1e-3) if "gain" in press else None
         figures = [number(press.get("contact_radius_px"), 1), number(press.get("error_deg"), 1), number(wide, 2)]
-        rows.append([press["name"], center, *figures, "" if press["used"] else f"left out: {press.get('reason', '')}"])
+        rows.append([press["name"], center, *figures, f"{'' if press['used'] else 'left out: '}{press.get('reason', '')}"])
     titles = ("press", "center px", "contact radius px", "error deg", "times as wide as given", "")
     meaning = "error, times as wide: slopes by the field of the other presses, or by the prior, compared with the ball's"
     return [markdown(titles, rows), meaning]

@@ -102,8 +102,8 @@ def _wrong_diameter(contact: Contact, gain: float, others: int, by_prior: bool) 
         reference = "the sensor's prior" + (f" and {reference}" if others else "")
     return (
         f"counts {contact.weight:.2f} of a press: by {reference} the ball seems {2 * contact.radius_mm / gain:.2f} mm wide, but "
-        f"{2 * contact.radius_mm:g} mm was given: a wrong diameter, or skin that answers otherwise than where they lie; more presses "
-        "beside it will show which"
+        f"{2 * contact.radius_mm:g} mm was given: a wrong diameter, or skin that answers otherwise than where they lie; more "
+        "presses beside it will show which"
     )
 
 

@@ -42,7 +42,7 @@ def press(unit, tmp_path_factory):
     folder = tmp_path_factory.mktemp("view")
     calibration.save(folder / "unit.safetensors")
     write_film(folder / "press.avi", [camera(1.0 if k >= 14 else 0.0) for k in range(18)])
-    return ["--source", folder / "press.avi", "--calibration", folder / "unit.safetensors"]
+    return [folder / "unit.safetensors", folder / "press.avi"]
 
 
 def read_back(path):

@@ -4,43 +4,28 @@ The first frames must be without contact. Ctrl-C ends it and finishes the files.
 or is in doubt.
 
 examples:
-  torchvts stream --source 0 --sensor gelsight_mini
-  torchvts stream --source video.avi --sensor gelsight_wedge --out out/ball
-  torchvts stream --source folder/ --calibration unit.safetensors --out out/run
+  torchvts stream 0 --sensor gelsight_mini
+  torchvts stream video.avi --sensor gelsight_wedge --out out/ball
+  torchvts stream unit.safetensors folder/ --out out/run
 """
 
 import argparse
 import contextlib
 import dataclasses
-from collections.abc import Sequence
 from pathlib import Path
 
-from ..calibration import Press
 from ..core.files import check_target, make_folder
 from ..model import Calibration, Sensor
-from ..stream import (
-    Overlay,
-    Sheet,
-    StreamReport,
-    TactileFrame,
-    TactileStream,
-    VideoFile,
-    read_background,
-    read_press_images,
-)
+from ..stream import Overlay, Sheet, StreamReport, TactileFrame, TactileStream, VideoFile
 from ..viz import save_figure
-from .options import add_press, calibrated
-from .parser import UsageError
 from .source import add_source, add_video, load_unit, open_stream, play
 
-USAGE = "--source SOURCE (--sensor NAME | --calibration FILE) [--out FOLDER]"
+USAGE = "CALIBRATION SOURCE [--out FOLDER]"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the subcommand."""
     add_source(parser)
-    parser.add_argument("--background", type=Path, nargs="+", metavar="IMAGE", help="to calibrate: without contact; or a video")
-    add_press(parser)
     parser.add_argument("--save-calibration", type=Path, metavar="FILE", help="write the calibration, .safetensors")
     parser.add_argument(
         "--corners",
@@ -52,9 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Stream until the source ends, and print a summary."""
-    unit = load_unit(arguments)
-    if arguments.calibration is not None and (arguments.background or arguments.press):
-        raise UsageError("--background, --press: they are to calibrate with --sensor, not beside --calibration")
+    unit, source = load_unit(arguments)
     if arguments.corners is not None:
         unit = with_corners(unit, arguments.corners)
     if arguments.save_calibration is not None:
@@ -63,13 +46,8 @@ def run(arguments: argparse.Namespace) -> int:
         print("give --out for an overlay video and files; torchvts view shows the stream live")
     else:
         make_folder(arguments.out)
-    presses: Sequence[Press] = ()
-    if isinstance(unit, Sensor):
-        presses = read_press_images(arguments.press, unit)
-    if isinstance(unit, Sensor) and arguments.background:
-        unit, presses = calibrated(read_background(arguments.background, unit, arguments.background_frames), unit, presses), ()
     with contextlib.ExitStack() as stack:
-        stream = stack.enter_context(open_stream(arguments, unit, presses))
+        stream = stack.enter_context(open_stream(arguments, unit, source))
         if arguments.save_calibration is not None:
             stream.calibration.save(arguments.save_calibration)
             print(f"wrote {arguments.save_calibration}")

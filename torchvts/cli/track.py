@@ -191,7 +191,7 @@ def _tracker_of_image(stream: TactileStream, path: Path, image: Tensor) -> PoseT
     if reason:
         raise ValueError(f"reference: {path}: {reason}")
     with torch.inference_mode():
-        return PoseTracker(stream.pipe(image), _pitch(stream))
+        return PoseTracker(stream.recording.pipe(image), _pitch(stream))
 
 
 def summary(tracking: _Tracking, stream: TactileStream) -> dict[str, Any]:

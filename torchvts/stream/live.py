@@ -74,10 +74,9 @@ class TactileStream:
         record: where the raw frames of a camera are written, see :class:`Recorder`; None for nowhere.
     Attributes:
         calibration: of the unit.
-        dropped: number of frames that nobody took.
         left_out: (number, reason) of the frames that could not be used.
+        recording: :class:`Recording`, that of the calibration and its background.
         stages: :class:`StageClock`.
-        fps: rate of the source.
     Raises:
         ValueError: contact or changing light in the first frames, or a source that cannot be read.
         OSError: no such source; also while frames are read: a camera was unplugged, or has stopped.
@@ -106,34 +105,26 @@ class TactileStream:
         if contact is not None:
             check_record("contact", contact, ContactSettings, "ContactSettings(sigmas=...) makes one")
         check_switch("realtime", realtime)
-        sensor = _sensor_of(sensor_or_calibration, background_frames, presses)
-        self.reader = _reader_of(source, reconnect_s, record)
-        self.fps = self.reader.fps
+        self._sensor = _sensor_of(sensor_or_calibration, background_frames, presses)
         self.stages = StageClock()
         self.left_out: list[tuple[int, str]] = []
         self._zero: list[Tensor] = []
         self._doubted = False
         self._zero_missing = 0
+        self._frames = SourceFrames(_reader_of(source, reconnect_s, record), background_frames, realtime, self.stages)
+        self._size = self._frames.readable[0].shape[:2]
+        self._codec: str = getattr(self.reader, "codec", "")
+        self._begin = partial(
+            Recording, mode=mode, network=network, device=device, contact=contact, codec=self._codec, stage=self.stages.stage
+        )
         try:
-            self._frames = SourceFrames(self.reader, background_frames, realtime, self.stages)
-            self._sensor, self._size = sensor, self._frames.readable[0].shape[:2]
             first = torch.cat([self._rectified(pixels) for pixels in self._frames.readable])
-            self._codec: str = getattr(self.reader, "codec", "")
             self.calibration = _calibrated(first, sensor_or_calibration, presses, self._codec)
-            self._start = partial(
-                Recording,
-                mode=mode,
-                network=network,
-                device=device,
-                contact=contact,
-                codec=self._codec,
-                stage=self.stages.stage,
-            )
-            self._use(self._start(self.calibration, first=first if background_frames > 0 else None))
+            self.recording = self._begin(self.calibration, first=first if background_frames > 0 else None)
         except BaseException as error:
-            self.reader.close()
-            if isinstance(error, NotAtRest) and sensor is sensor_or_calibration:  # what these frames made fits none of them
-                raise ValueError(UNKNOWN_LIGHT.format(sensor.name, int(background_frames))) from error
+            self.close()
+            if isinstance(error, NotAtRest) and isinstance(sensor_or_calibration, Sensor):  # what these frames made fits none
+                raise ValueError(UNKNOWN_LIGHT.format(self._sensor.name, int(background_frames))) from error
             raise
 
     def _rectified(self, pixels: Pixels) -> Tensor:
@@ -153,10 +144,6 @@ class TactileStream:
         """
         self._zero, self._zero_missing = [], check_integer("frames", frames, 3)
 
-    def _use(self, recording: Recording) -> None:
-        """Go on with a recording: the first one, or that of a new background."""
-        self.recording, self.pipe = recording, recording.pipe
-
     def _collect(self, raw: Tensor) -> None:
         """Keep a frame for the new background, and change to it when there are enough."""
         self._zero.append(raw)
@@ -168,11 +155,19 @@ class TactileStream:
         try:
             background = find_background(first, self.calibration.sensor, self._codec).clamp(0.0, 1.0)
             calibration = with_background(self.calibration, background)
-            self._use(self._start(calibration, first=first))
+            self.recording, self.calibration = self._begin(calibration, first=first), calibration
         except ValueError as error:
             warnings.warn(f"re-zero refused, the background stays: {error}", stacklevel=3)
-        else:
-            self.calibration = calibration
+
+    @property
+    def reader(self) -> Reader:
+        """What reads the source."""
+        return self._frames.reader
+
+    @property
+    def fps(self) -> float:
+        """Rate of the source, frames a second."""
+        return self.reader.fps
 
     @property
     def metric(self) -> bool:

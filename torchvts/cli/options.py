@@ -69,7 +69,7 @@ def add_background_frames(parser: argparse._ActionsContainer) -> None:
         type=int,
         default=FIRST_FRAMES,
         metavar="N",
-        help=f"first of a video, without contact ({FIRST_FRAMES})",
+        help=f"first frames, without contact ({FIRST_FRAMES})",
     )
 
 

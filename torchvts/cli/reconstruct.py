@@ -20,7 +20,7 @@ from tqdm import tqdm
 
 from ..core.files import make_folder
 from ..core.recordings import is_film
-from ..dataset import CLOUD_FORMATS, FORMATS, PICTURES_UP_TO, Report, list_items, reconstruct_dataset
+from ..dataset import CLOUD_FORMATS, FORMATS, PICTURES_UP_TO, RunReport, list_items, reconstruct_dataset
 from ..diagnose import Finding, diagnose
 from ..model import Calibration, Sensor
 from ..model.report import warnings_of
@@ -51,7 +51,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--format", choices=FORMATS, default="npz", metavar="KIND", help=kinds)
     parser.add_argument("--cloud", choices=CLOUD_FORMATS, default="none", metavar="KIND", help="contact: ply, pcd, obj (surface)")
     add_length_unit(parser)
-    parser.add_argument("--pictures", action=argparse.BooleanOptionalAction, help=f"drawn for at most {PICTURES_UP_TO} frames")
+    parser.add_argument("--pictures", action=argparse.BooleanOptionalAction, help=f"of each frame (of {PICTURES_UP_TO} at most)")
     parser.add_argument("--batch", type=int, default=8, metavar="N", help="frames that a loader hands over at once (8)")
     parser.add_argument("--workers", type=int, metavar="N", help="loader processes of each rank (up to 4)")
     parser.add_argument("--threads", type=int, default=1, metavar="N", help="of each rank (1); results vary in last bits")
@@ -105,7 +105,7 @@ def print_unit(unit: Calibration) -> None:
         print(*doubts_of(unit.report), sep="\n")
 
 
-def print_report(report: Report, out: Path, metric: bool) -> None:
+def print_report(report: RunReport, out: Path, metric: bool) -> None:
     """Print the deepest frames, how many were left out, which are in doubt, and where the results are."""
     with (out / "frames.csv").open(encoding="utf-8", errors="replace", newline="") as stream:
         rows = list(csv.DictReader(stream))
@@ -129,7 +129,7 @@ def print_report(report: Report, out: Path, metric: bool) -> None:
     print(f"wrote {frames} to {out}{before}; table in frames.csv, units in summary.json")
 
 
-def diagnose_some(unit: Calibration, inputs: list[Path], report: Report, every: int) -> list[tuple[str, Finding]]:
+def diagnose_some(unit: Calibration, inputs: list[Path], report: RunReport, every: int) -> list[tuple[str, Finding]]:
     """What is wrong with :data:`DIAGNOSED` images, and the first frame of each video; frames that were left out are not asked.
 
     A finding is given once, with its first frame and how many more have it. Of a frame in doubt only faults are given.

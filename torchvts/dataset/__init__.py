@@ -1,7 +1,7 @@
 """Depth of whole data sets: folders and videos of any size."""
 
 from .items import PICTURES_UP_TO, STATE, list_items, output_stems
-from .reconstruct import CLOUD_FORMATS, Report, reconstruct_dataset
+from .reconstruct import CLOUD_FORMATS, RunReport, reconstruct_dataset
 from .records import FORMATS
 
 __all__ = [
@@ -9,7 +9,7 @@ __all__ = [
     "FORMATS",
     "PICTURES_UP_TO",
     "STATE",
-    "Report",
+    "RunReport",
     "list_items",
     "output_stems",
     "reconstruct_dataset",

@@ -45,7 +45,7 @@ CLOUD_FORMATS = ("ply", "obj", "pcd", "none")
 """Kinds of files for the contact of a frame."""
 
 
-class Report(NamedTuple):
+class RunReport(NamedTuple):
     """What a run did; known to rank 0 only.
 
     Attributes:
@@ -87,7 +87,7 @@ def reconstruct_dataset(
     threads: int = 1,
     overwrite: bool = False,
     strict: bool = False,
-) -> Report:
+) -> RunReport:
     """Reconstruct every image and video frame of a source, and continue where an earlier run was stopped.
 
     Under ``torchrun`` (or any launcher that sets RANK, WORLD_SIZE, MASTER_ADDR, MASTER_PORT) the processes share the work; ``out``
@@ -216,7 +216,7 @@ class _Worker:
         self.notes: list[tuple[str, str]] = []
         self.done = self.failed = 0
 
-    def run(self, batch: int, workers: int | None) -> Report:
+    def run(self, batch: int, workers: int | None) -> RunReport:
         """Do the whole share; rank 0 then writes the tables. Files are written by threads: most of that is waiting for the disk."""
         rank, world = self.share
         source = self.records.source
@@ -240,11 +240,11 @@ class _Worker:
         done = sum_over_processes(self.done)
         seconds = time.perf_counter() - start
         if rank > 0:
-            return Report(rank, 0, 0, [], seconds)
+            return RunReport(rank, 0, 0, [], seconds)
         self.records.join_videos()
         rows, failed, doubted = self.records.write_tables()
         self.writer.write_summary(rows, len(failed), len(doubted))
-        return Report(0, rows, rows - done, failed, seconds, self.notes, doubted)
+        return RunReport(0, rows, rows - done, failed, seconds, self.notes, doubted)
 
     def _depths(self, loaded: Iterable[tuple[Entry, Tensor | None]]) -> Iterator[_Reconstructed]:
         """The frames of this rank with image and depth; those of a video once its first frames are there."""

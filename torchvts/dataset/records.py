@@ -17,6 +17,7 @@ from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
+from ..core.checks import brief
 from ..core.files import make_folder, naming, write_atomically
 from ..core.results import join_results
 from ..stream import FIRST_FRAMES
@@ -122,6 +123,11 @@ def join(out: Path, settings: Settings) -> Settings:
         raise ValueError(f"{path}: not the settings of a run ({error}): give another --out, or --overwrite") from error
     if settings.pictures is None:
         settings = replace(settings, pictures=begun.pictures)
+    if begun.source != settings.source:
+        raise ValueError(
+            f"out: {out} holds the results of {brief(begun.source)}, not of {brief(settings.source)}: give each input another "
+            "--out, or name all inputs in one command, with --overwrite to begin anew"
+        )
     names = {"calibration_sha256": "calibration file"}
     other = [
         f"{names.get(field.name, field.name)} {str(getattr(begun, field.name))[:60]!r} then, "

@@ -4,9 +4,10 @@ Ji, Liu, Ma: Model-Based 3D Contact Geometry Perception for Visual Tactile Senso
 
     python examples/paper.py
 
-A ball with a radius of 160 px is pressed 16 and 32 px deep into the skin of a drawn sensor, which has dark spots. The sensor is
-calibrated from its one image without contact. Depth is found by the fast method (eq. 9) and by the precise one (eq. 10), and compared with the truth.
-Lengths are in mm, x points right and y down, z towards the camera; depth is positive where the skin is pressed in.
+A ball with a radius of 160 px is pressed 16 and 32 px deep into the skin of a drawn sensor, which has spots. The sensor is
+calibrated from its one image without contact. Depth is found by the fast method (eq. 9) and by the precise one (eq. 10), and
+compared with the truth. Lengths are in mm, x points right and y down, z towards the camera; depth is positive where the skin is
+pressed in.
 """
 
 import math

@@ -166,7 +166,7 @@ def test_other_settings_are_refused_and_overwrite_begins_anew(unit, tmp_path):
         with pytest.raises(ValueError, match="was begun with other settings") as caught:
             reconstruct_dataset(calibration, source, out, **options)
         assert part in str(caught.value)
-    with pytest.raises(ValueError, match="holds the results of .*, not of .*: give each input another --out, or name all inputs"):
+    with pytest.raises(ValueError, match=r"holds the results of .*, not of .*: give each input another --out"):
         reconstruct_dataset(unit, fill(tmp_path / "second", ["b.png"]), out, mode="fast", pictures=False)
     report = reconstruct_dataset(unit, source, out, mode="precise", format="npy", pictures=False, overwrite=True)
     assert (report.rows, report.before) == (1, 0)

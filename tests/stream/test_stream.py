@@ -798,7 +798,7 @@ def test_the_golf_ball_appears_and_vanishes(data):
 
 def test_a_sensor_of_which_no_more_than_pitch_and_corners_is_known_is_told_what_to_press(data, run_stream, tmp_path):
     wedge = vts.Sensor.load("gelsight_wedge")
-    vts.Sensor("mine", 300, 400, 0.09, corners_px=wedge.corners_px).save(tmp_path / "mine.yaml")
+    vts.Sensor("mine", 150, 200, 0.18, corners_px=wedge.corners_px).save(tmp_path / "mine.yaml")
     video = next((data / "wedge_video").glob("*.avi"))
     done = run_stream(video, "--sensor", tmp_path / "mine.yaml")
     assert done.returncode == 2 and "calibration's background" not in done.stderr and "background-frames 0" not in done.stderr

@@ -13,12 +13,10 @@ from ..calibration import Press
 from ..core.checks import check_integer
 from ..model import Calibration, Sensor
 from ..stream import (
-    Camera,
     CameraSettings,
     Recorder,
     TactileFrame,
     TactileStream,
-    find_camera,
     read_background,
     read_press_images,
 )
@@ -60,10 +58,6 @@ def load_unit(arguments: argparse.Namespace) -> tuple[Sensor | Calibration, str]
 def open_stream(arguments: argparse.Namespace, unit: Sensor | Calibration, source: str) -> TactileStream:
     """The stream of the source; says what it found."""
     started = time.perf_counter()
-    settings = CameraSettings(arguments.size and tuple(arguments.size), arguments.fps, arguments.exposure, arguments.white_balance)
-    camera = find_camera(source)
-    if settings.given and camera is None:
-        raise UsageError(f"--size, --fps, --exposure, --white-balance: expected a camera of this machine, got {source!r}")
     presses: Sequence[Press] = ()
     if isinstance(unit, Sensor):
         presses = read_press_images(arguments.press, unit)
@@ -71,7 +65,7 @@ def open_stream(arguments: argparse.Namespace, unit: Sensor | Calibration, sourc
             image = read_background(arguments.background, unit, arguments.background_frames)
             unit, presses = calibrated(image, unit, presses), ()
     stream = TactileStream(
-        source if camera is None or not settings.given else Camera(camera, settings),
+        source,
         unit,
         mode=arguments.mode,
         background_frames=arguments.background_frames,
@@ -81,6 +75,9 @@ def open_stream(arguments: argparse.Namespace, unit: Sensor | Calibration, sourc
         device=arguments.device,
         contact=contact_of(arguments.contact),
         record=arguments.record,
+        settings=CameraSettings(
+            arguments.size and tuple(arguments.size), arguments.fps, arguments.exposure, arguments.white_balance
+        ),
     )
     first = arguments.background_frames
     note = f"the first {first} are without contact" if first else "the calibration's background is used as it is"

@@ -21,6 +21,7 @@ from .background import (
     find_background,
     with_background,
 )
+from .cameras import AS_IT_IS, CameraSettings
 from .numbered import SourceFrames
 from .record import Recorder
 from .recording import NotAtRest, Recording
@@ -72,6 +73,7 @@ class TactileStream:
         reconnect_s: for how long a camera that has stopped is opened again before an error is raised; not with a :class:`Reader`.
         contact: thresholds of contact; None for the usual ones.
         record: where the raw frames of a camera are written, see :class:`Recorder`; None for nowhere.
+        settings: size, rate, exposure and white balance of a camera; not with a :class:`Reader`.
     Attributes:
         calibration: of the unit.
         left_out: (number, reason) of the frames that could not be used.
@@ -100,10 +102,12 @@ class TactileStream:
         reconnect_s: float = 0.0,
         contact: ContactSettings | None = None,
         record: str | Path | None = None,
+        settings: CameraSettings = AS_IT_IS,
     ) -> None:
         check_choice("mode", mode, MODES)
         if contact is not None:
             check_record("contact", contact, ContactSettings, "ContactSettings(sigmas=...) makes one")
+        check_record("settings", settings, CameraSettings)
         check_switch("realtime", realtime)
         self._sensor = _sensor_of(sensor_or_calibration, background_frames, presses)
         self.stages = StageClock()
@@ -111,7 +115,7 @@ class TactileStream:
         self._zero: list[Tensor] = []
         self._doubted = False
         self._zero_missing = 0
-        self._frames = SourceFrames(_reader_of(source, reconnect_s, record), background_frames, realtime, self.stages)
+        self._frames = SourceFrames(_reader_of(source, reconnect_s, record, settings), background_frames, realtime, self.stages)
         self._size = self._frames.readable[0].shape[:2]
         self._codec: str = getattr(self.reader, "codec", "")
         self._begin = partial(
@@ -256,12 +260,16 @@ def _calibrated(first: Tensor, unit: Sensor | Calibration, presses: Sequence[Pre
         return calibrate(background, unit, presses)
 
 
-def _reader_of(source: str | int | Path | Reader, reconnect_s: float, record: str | Path | None) -> Reader:
+def _reader_of(
+    source: str | int | Path | Reader, reconnect_s: float, record: str | Path | None, settings: CameraSettings
+) -> Reader:
     """Open a source, or take a reader of the user's own; record what it gives."""
     if isinstance(source, str | int | Path):
-        reader = open_source(source, reconnect_s)
+        reader = open_source(source, reconnect_s, settings)
     elif check_least("reconnect_s", reconnect_s) > 0:
         raise ValueError(f"reconnect_s: expected 0 with a reader of your own, got {reconnect_s:g}: it must reconnect by itself")
+    elif settings.given:
+        raise ValueError(f"settings: expected none with a reader of your own, got {settings}: it must ask the driver by itself")
     else:
         reader = check_reader(source)
     if record is None:

@@ -1,4 +1,4 @@
-"""Large data sets: every frame once and the same, whatever the batch, the workers, the processes, and wherever a run was killed."""
+"""Large data sets: every frame once and the same, whatever the workers, the processes, and wherever a run was killed."""
 
 import contextlib
 import json
@@ -88,8 +88,8 @@ def wait_for(condition, process):
         time.sleep(0.02)
 
 
-def test_batch_and_workers_do_not_matter(unit, frames, whole, tmp_path):
-    reconstruct_dataset(unit, frames, tmp_path, batch=7, workers=2)
+def test_workers_do_not_matter(unit, frames, whole, tmp_path):
+    reconstruct_dataset(unit, frames, tmp_path, workers=2)
     assert contents(tmp_path) == whole
 
 
@@ -98,7 +98,7 @@ def test_batch_and_workers_do_not_matter(unit, frames, whole, tmp_path):
 def test_killed_processes_lose_nothing_and_the_next_run_goes_on(unit, frames, whole, tmp_path, killed):
     out = tmp_path / "out"
     launcher = () if killed == "the only" else TORCHRUN
-    first = started(launcher, unit, frames, "--out", out, "--batch", 2, "--workers", 0)
+    first = started(launcher, unit, frames, "--out", out, "--workers", 0)
     wait_for(lambda: finished(out) >= 20, first)
     processes = family(first.pid)
     for pid in [max(processes)] if killed == "one" else processes:

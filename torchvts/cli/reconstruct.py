@@ -30,7 +30,7 @@ from .options import add_length_unit, add_out, add_pipeline, add_unit, calibrate
 from .parser import UsageError
 
 PASSED = (
-    "mode", "format", "cloud", "length_unit", "pictures", "every", "network", "device", "background_frames", "batch", "workers",
+    "mode", "format", "cloud", "length_unit", "pictures", "every", "network", "device", "background_frames", "workers",
     "threads", "overwrite", "strict",
 )  # fmt: skip
 """Options that :func:`reconstruct_dataset` has under the same names."""
@@ -52,7 +52,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--cloud", choices=CLOUD_FORMATS, default="none", metavar="KIND", help="contact: ply, pcd, obj (surface)")
     add_length_unit(parser)
     parser.add_argument("--pictures", action=argparse.BooleanOptionalAction, help=f"of each frame (of {PICTURES_UP_TO} at most)")
-    parser.add_argument("--batch", type=int, default=8, metavar="N", help="frames that a loader hands over at once (8)")
     parser.add_argument("--workers", type=int, metavar="N", help="loader processes of each rank (up to 4)")
     parser.add_argument("--threads", type=int, default=1, metavar="N", help="of each rank (1); results vary in last bits")
     parser.add_argument("--overwrite", action="store_true", help="begin anew, whatever --out holds")

@@ -4,9 +4,9 @@ Every process lists the source in the same order, takes each N-th image and each
 done already (:mod:`.records`). At the end rank 0 writes ``frames.csv``. Only the names of one folder are in memory at a time.
 
 Frames of a video go the way of a stream (:class:`torchvts.stream.Recording`): every process follows the light of all of them, and
-finds the depth of its own. An image is a recording of one frame. A frame's result does not depend on batch size, loader workers or
-processes: each goes through the pipeline by itself, on the same number of threads everywhere. (More threads split sums otherwise:
-depth then differs by up to 3e-7 mm.)
+finds the depth of its own. An image is a recording of one frame. A frame's result does not depend on loader workers or processes:
+each goes through the pipeline by itself, on the same number of threads everywhere. (More threads split sums otherwise: depth then
+differs by up to 3e-7 mm.)
 """
 
 import hashlib
@@ -36,7 +36,7 @@ from ..pose.output_frame import MM_OF
 from ..skin import ContactSettings, motion_of_unit
 from ..stream import FIRST_FRAMES, Recording, check_device
 from .items import Item, Source, list_items
-from .loading import Entry, load_frames
+from .loading import HANDED_OVER, Entry, load_frames
 from .processes import share, sum_over_processes
 from .records import FORMATS, Records, Settings, begin, join, locked
 from .writing import Writer
@@ -82,7 +82,6 @@ def reconstruct_dataset(
     device: str = "cpu",
     contact: ContactSettings | None = None,
     background_frames: int = FIRST_FRAMES,
-    batch: int = 8,
     workers: int | None = None,
     threads: int = 1,
     overwrite: bool = False,
@@ -112,7 +111,6 @@ def reconstruct_dataset(
         contact: thresholds of contact; None for the usual ones.
         background_frames: first frames of a video, which show the skin without contact; 0 uses the calibration as it is, and so
             does a video where they show contact or that is shorter, with a note.
-        batch: frames that a loader worker hands over at once.
         workers: loader processes of each rank; None chooses.
         threads: of each rank. Results are bit for bit the same only for the same number, so it is one of the settings kept.
         overwrite: begin anew, whatever ``out`` holds.
@@ -131,7 +129,6 @@ def reconstruct_dataset(
     ):
         check_choice(name, value, allowed)
     for name, number, least in (
-        ("batch", batch, 1),
         ("threads", threads, 1),
         ("every", every, 1),
         ("background_frames", background_frames, 0),
@@ -158,7 +155,7 @@ def reconstruct_dataset(
             if rank > 0:
                 settings = join(out, settings)
             records = Records(source, out, settings)
-            return _Worker(unit, Path(calibration).name, network, records, (rank, world), strict).run(batch, workers)
+            return _Worker(unit, Path(calibration).name, network, records, (rank, world), strict).run(workers)
     finally:
         torch.set_num_threads(before)
 
@@ -216,7 +213,7 @@ class _Worker:
         self.notes: list[tuple[str, str]] = []
         self.done = self.failed = 0
 
-    def run(self, batch: int, workers: int | None) -> RunReport:
+    def run(self, workers: int | None) -> RunReport:
         """Do the whole share; rank 0 then writes the tables. Files are written by threads: most of that is waiting for the disk."""
         rank, world = self.share
         source = self.records.source
@@ -224,12 +221,12 @@ class _Worker:
         total = sum(count_frames(item.file) if item.is_film else 1 for item in items) // world
         if workers is None:
             cores = (os.cpu_count() or 1) // int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
-            workers = 0 if total < 4 * batch else max(1, min(4, cores // 2))
+            workers = 0 if total < 4 * HANDED_OVER else max(1, min(4, cores // 2))
         writers = 1 if self.settings.pictures else 4  # matplotlib draws in one thread only
         waiting: deque[tuple[Entry, Future[str]]] = deque()
         start = time.perf_counter()
         with tqdm(total=total, unit="frame", disable=rank > 0 or None, smoothing=0.05) as bar, ThreadPoolExecutor(writers) as pool:
-            for frame, image, output in self._depths(load_frames(self.records, self.sensor, self.share, batch, workers)):
+            for frame, image, output in self._depths(load_frames(self.records, self.sensor, self.share, workers)):
                 bar.update(frame.length is None)
                 if not frame.done:
                     waiting.append((frame, pool.submit(self._write, frame, image, output)))

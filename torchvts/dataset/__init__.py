@@ -1,8 +1,8 @@
 """Depth of whole data sets: folders and videos of any size."""
 
-from .items import PICTURES_UP_TO, STATE, list_items, output_stems
-from .reconstruct import CLOUD_FORMATS, RunReport, reconstruct_dataset
-from .records import FORMATS
+from .items import FORMATS, PICTURES_UP_TO, STATE, list_items, output_stems
+from .reconstruct import CLOUD_FORMATS, reconstruct_dataset
+from .worker import RunReport
 
 __all__ = [
     "CLOUD_FORMATS",

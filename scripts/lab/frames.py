@@ -35,11 +35,6 @@ USED = ("fast", "precise")
 BATCHES = (1, 4, 16, 64)
 CAMERA_FRAMES = 600
 
-LOADERS: dict[str, Callable[[str], Callable[[Tensor], object]]] = {
-    "torchscript": torch.jit.load,
-}
-"""How a file of each exported format is loaded."""
-
 
 class Unit(NamedTuple):
     """A unit at one size: its calibration, a frame (1, 3, H, W) with contact, and a frame of the peer; None without."""
@@ -211,21 +206,14 @@ def _cell(time: Time | None) -> str:
 # exported files
 
 
-def export_table(unit: Unit, formats: Sequence[str], calls: int) -> str:
-    """Median ms of a frame in the library and in exported files, in turn in one process."""
+def export_table(unit: Unit, calls: int) -> str:
+    """Median ms of a frame in the library and in a file of TorchScript, in turn in one process."""
     lines = []
     for mode in USED:
         pipe = DepthPipeline.from_calibration(unit.calibration, mode)
         with tempfile.TemporaryDirectory() as folder:
-            frames: list[Callable[[Tensor], object]] = [pipe.freeze(), *(_written(pipe, name, Path(folder)) for name in formats)]
-            every = in_turn([partial(frame, unit.image) for frame in frames], calls)
-        own, *others = map(statistics.median, every)
-        lines.append([mode, f"{own:.2f}", *(f"{other:.2f}, {other / own:.1f} times" for other in others)])
-    return markdown(["mode", "library", *formats], lines)
-
-
-def _written(pipe: DepthPipeline, name: str, folder: Path) -> Callable[[Tensor], object]:
-    """The file of a format, written and loaded."""
-    path = folder / export.FORMATS[name].file_name
-    export.FORMATS[name].write(pipe, path)
-    return LOADERS[name](str(path))
+            file = torch.jit.load(export.export_torchscript(pipe, Path(folder) / "pipeline.pt"))  # type: ignore[no-untyped-call]
+            every = in_turn([partial(pipe.freeze(), unit.image), partial(file, unit.image)], calls)
+        own, other = map(statistics.median, every)
+        lines.append([mode, f"{own:.2f}", f"{other:.2f}, {other / own:.1f} times"])
+    return markdown(["mode", "library", "torchscript"], lines)

@@ -26,7 +26,6 @@ from conftest import Frames, write_film
 import torchvts as vts
 from lab.latency import measure_latency
 from torchvts import stream as streams
-from torchvts.cli.stream import with_corners
 from torchvts.core.files import rgb_from_bgr
 from torchvts.pipeline import unit_pipeline
 from torchvts.stream.sources import times_file
@@ -726,7 +725,7 @@ def test_track_refuses_a_reference_that_cannot_be_used_and_counts_bad_frames(uni
 def test_bad_arguments_are_refused_in_a_sentence(run_stream, video, tmp_path):
     for arguments, part in (
         ([tmp_path / "none.avi", "--sensor", "tacto"], "source: "),
-        ([video, "--sensor", "gelsight_wedge", "--corners", "1 2 3"], "corners: expected eight numbers"),
+        ([video, "--sensor", "gelsight_wedge", "--press", video, "wide"], "press: expected the diameter of the ball in mm"),
     ):
         done = run_stream(*arguments)
         assert done.returncode == 2 and done.stderr.startswith("torchvts: error: ") and part in done.stderr, done.stderr
@@ -805,18 +804,6 @@ def test_a_sensor_of_which_no_more_than_pitch_and_corners_is_known_is_told_what_
     assert "how sensor 'mine' is lit cannot be found in its first 12 frames alone: press a ball of known diam" in done.stderr
     done = run_stream(video, "--sensor", tmp_path / "mine.yaml", "--device", "gpu")
     assert done.returncode == 2 and "device: expected cpu, cuda" in done.stderr
-
-
-def test_corners_take_the_place_of_the_crop_of_raw_frames():
-    frame, mini = torch.rand(1, 3, 480, 640), vts.Sensor.load("gelsight_mini")
-    frame = torch.nn.functional.avg_pool2d(frame, 31, 1, 15)
-    (left, top), (right, bottom) = (91.0, 68.0), (548.0, 411.0)
-    cut = with_corners(mini, f"{left},{top} {right},{top} {right},{bottom} {left},{bottom}")
-    assert torch.allclose(cut.rectify(frame), mini.rectify(frame), atol=0.005)
-    lying, digit = frame[:, :, :240, :320], vts.Sensor.load("digit")  # the gel's top left is at the frame's top right
-    assert torch.allclose(with_corners(digit, "319 0 319 239 0 239 0 0").rectify(lying), digit.rectify(lying), atol=1e-5)
-    upright = digit.rectify(lying)
-    assert torch.allclose(with_corners(digit, "0 0 239 0 239 319 0 319").rectify(upright), upright, atol=1e-5)
 
 
 def test_a_narrow_image_can_be_a_background():

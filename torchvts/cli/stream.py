@@ -11,11 +11,9 @@ examples:
 
 import argparse
 import contextlib
-import dataclasses
 from pathlib import Path
 
 from ..core.files import check_target, make_folder
-from ..model import Calibration, Sensor
 from ..stream import Overlay, Sheet, StreamReport, TactileFrame, TactileStream, VideoFile
 from ..viz import save_figure
 from .source import add_source, add_video, load_unit, open_stream, play
@@ -27,10 +25,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the subcommand."""
     add_source(parser)
     parser.add_argument("--save-calibration", type=Path, metavar="FILE", help="write the calibration, .safetensors")
-    parser.add_argument(
-        "--corners",
-        help='of the gel in place of the sensor\'s: "x y x y x y x y", from top left, clockwise; straightened first',
-    )
     parser.add_argument("--out", type=Path, metavar="FOLDER", help="for overlay video, sheet.png, frames.csv and summary.json")
     add_video(parser)
 
@@ -38,8 +32,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Stream until the source ends, and print a summary."""
     unit, source = load_unit(arguments)
-    if arguments.corners is not None:
-        unit = with_corners(unit, arguments.corners)
     if arguments.save_calibration is not None:
         check_target(arguments.save_calibration)
     if arguments.out is None:
@@ -87,18 +79,3 @@ class _Files:
                     self.video.write(picture)
             self.shown = frame.number
         return True
-
-
-def with_corners(unit: Sensor | Calibration, text: str) -> Sensor | Calibration:
-    """The sensor or calibration with other corners, of the gel in frames as they come (straightened, if it has a lens): they turn
-    and mirror these too."""
-    try:
-        numbers = [float(part) for part in text.replace(",", " ").split()]
-    except ValueError:
-        numbers = []
-    if len(numbers) != 8:
-        raise ValueError(f"corners: expected eight numbers, x and y of four corners, got {text!r}")
-    sensor = unit if isinstance(unit, Sensor) else unit.sensor
-    corners = tuple(zip(numbers[::2], numbers[1::2]))
-    sensor = dataclasses.replace(sensor, corners_px=corners, roi_px=None, raw_size_px=(), raw_crop=0.0, turn_deg=0, mirror=False)
-    return sensor if isinstance(unit, Sensor) else dataclasses.replace(unit, sensor=sensor)

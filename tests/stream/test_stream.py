@@ -235,25 +235,6 @@ def test_each_frame_is_measured_in_its_own_light(unit, small_press, brightness):
     assert stream.conditions.light[0, :, 0].tolist() == pytest.approx([brightness(39)] * 3, abs=0.02) and stream.doubt == ""
 
 
-@pytest.mark.long
-def test_a_held_contact_does_not_fade(unit):
-    calibration, camera = unit
-    pictures = (camera(1.0 if k >= 15 else 0.0) for k in range(315))
-    with streams.TactileStream(Frames(pictures), calibration) as stream:
-        frames = [(float(f.output.depth_mm.max()), int(f.output.contact.sum())) for f in stream]
-    first, last = np.mean(frames[15:25], 0), np.mean(frames[-10:], 0)
-    assert last == pytest.approx(first, rel=0.01)
-
-
-def test_dimming_while_a_contact_is_held_is_followed_around_it(unit):
-    calibration, camera = unit
-    pictures = (camera(1.0 if k >= 15 else 0.0, dimming(k)) for k in range(300))
-    with streams.TactileStream(Frames(pictures), calibration) as stream:
-        frames = [(float(f.output.depth_mm.max()), int(f.output.contact.sum())) for f in stream]
-    first, last = np.mean(frames[15:25], 0), np.mean(frames[-10:], 0)
-    assert last == pytest.approx(first, rel=0.03)
-
-
 def test_a_step_of_the_light_is_in_the_table_and_a_dead_led_is_in_doubt(unit):
     calibration, camera = unit
     dead = np.array([1.0, 1.0, 0.0])  # of blue, green, red

@@ -18,7 +18,6 @@ from lab.commands import main_of, parser_of
 from lab.sets import data_folder
 from torchvts import viz
 from torchvts.pose import contact_cloud
-from torchvts.training.balls import fit_sphere
 from torchvts.training.presses import Training
 
 PITCH = 0.0625
@@ -50,7 +49,7 @@ def figure_4(folder: Path, out: Path) -> list[str]:
             error = metrics.depth_error(result.depth_mm, truth, PITCH)
             found = ""
             if sphere:
-                fit = fit_sphere(result.depth_mm, PITCH, result.contact)
+                fit = metrics.fit_sphere(result.depth_mm, PITCH, result.contact)
                 found = f"({', '.join(f'{v + 0.0:.3f}' for v in fit.center_mm)}), {fit.radius_mm:.3f}"
             rows.append(
                 f"| {camera}, {case} | {paper} | {error.max_px:.2f} ({error.max_mm:.3f} mm) | {error.rms_px:.3f} "

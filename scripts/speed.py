@@ -26,11 +26,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--threads", type=int, default=torch.get_num_threads(), help="all cores if not given")
     parser.add_argument("--only", choices=("user", "methods", "export"), help="measure one table; export only where asked for")
     parser.add_argument("--calls", type=int, default=100, help="frames of each row of the tables of the user and of exported files")
-    parser.add_argument("--long", action="store_true", help="10,000 frames every 20 ms too, for the 99th percentile")
     exported = parser.add_argument_group("exported files")
     exported.add_argument("--drawn", action="store_true", help="of the drawn rig, also where there is a real sensor")
     exported.add_argument("--size", type=int, nargs=2, default=(320, 240), metavar=("WIDTH", "HEIGHT"))
-    exported.add_argument("--formats", nargs="+", choices=frames.LOADERS, default=list(frames.LOADERS))
     arguments = parser.parse_args(argv)
     torch.set_num_threads(arguments.threads)
     data = data_folder() if (data_folder() / "gelsight_mini_a").is_dir() else None
@@ -38,7 +36,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         size = arguments.size[1], arguments.size[0]
         unit = frames.drawn(size) if data is None or arguments.drawn else frames.mini(data, size)
         print(f"{unit.name}, {size[1]}x{size[0]}, {arguments.threads} threads, median ms of a frame")
-        print(frames.export_table(unit, arguments.formats, arguments.calls))
+        print(frames.export_table(unit, arguments.calls))
         return 0
     with tqdm(unit="row", disable=None) as bar:
 
@@ -47,7 +45,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             bar.update()
 
         if arguments.only != "methods":
-            measured = frames.as_user(show, data, arguments.calls, arguments.long)
+            measured = frames.as_user(show, data, arguments.calls)
             keep(arguments.out, "user", frames.user_table(measured), measured)
         if arguments.only != "user":
             measured = speed.methods(show, data)

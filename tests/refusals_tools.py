@@ -117,16 +117,17 @@ TABLE = {
         | {"network": [], "device": [None, "gpu", "cuda:99"], "contact": ["4.5", 4.5], "codec": []}),
     "stream.StreamReport": Entry({"stream": ...}, {"stream": [None, "camera"]}, run=False),
     "stream.TactileStream": Entry({"source": ..., "sensor_or_calibration": sensor(), "mode": "fast", "background_frames": 12,
-        "presses": (), "network": None, "device": "cpu", "reconnect_s": 0.0, "contact": None, "record": None}, {
-        "reconnect_s": ["1", None, NAN, -1.0], "source": ["no/such.mp4", None, 2.5],
+        "presses": (), "network": None, "device": "cpu", "reconnect_s": 0.0, "contact": None, "record": None,
+        "settings": vts.stream.CameraSettings()}, {
+        "settings": [None, (640, 480)], "reconnect_s": ["1", None, NAN, -1.0], "source": ["no/such.mp4", None, 2.5],
         "sensor_or_calibration": [None, "gelsight_mini"], "mode": ["slow", None], "background_frames": INTEGER, "presses": [],
         "network": [], "device": [], "contact": ["4.5", 4.5], "record": []}, run=False),
     "stream.Recorder": Entry(
         {"reader": Frames([]), "path": "raw"}, {"reader": [], "path": ["raw.avi", None, 2.5]}, named={"path": "record"}, run=False),
     "stream.VideoFile": Entry(
         {"path": "film.avi", "fps": 10.0}, {"path": ["film.gif", "film"], "fps": NUMBER}, named={"path": "video"}),
-    "stream.open_source": Entry({"source": ..., "reconnect_s": 0.0}, {
-        "source": ["no/such.mp4", ".", None, 2.5, True, -1, 2**31, 10**400, "9" * 20, "\u00b2"],
+    "stream.open_source": Entry({"source": ..., "reconnect_s": 0.0, "settings": vts.stream.CameraSettings()}, {
+        "settings": [None, (640, 480)], "source": ["no/such.mp4", ".", None, 2.5, True, -1, 2**31, 10**400, "9" * 20, "\u00b2"],
         "reconnect_s": ["1", None, NAN, -1.0]}, run=False),
     **dict.fromkeys(("frames", "stream.frames"), Entry(
         {"source": ...}, {"source": ["no/such.mp4", ".", None, 2.5, True, -1, 2**31, 10**400, "9" * 20, "\u00b2"]}, run=False)),

@@ -26,7 +26,7 @@ from torchvts.pipeline import DepthPipeline
 from .latency import measure_latency
 from .peers import peer_frame
 from .rows import Row, Size, Time
-from .speed import GS_SDK, PACES, Progress, memory_mb, ms, size_text, time_of
+from .speed import GS_SDK, PACES, Progress, ms, size_text, time_of
 from .timing import CAMERA_S, SIZES, in_turn, machine, rig
 
 USED = ("fast", "precise")
@@ -34,11 +34,6 @@ USED = ("fast", "precise")
 
 BATCHES = (1, 4, 16, 64)
 CAMERA_FRAMES = 600
-
-LOADERS: dict[str, Callable[[str], Callable[[Tensor], object]]] = {
-    "torchscript": torch.jit.load,
-}
-"""How a file of each exported format is loaded."""
 
 
 class Unit(NamedTuple):
@@ -96,7 +91,7 @@ def batches(unit: Unit, calls: int) -> Iterator[Row]:
 
 
 def costs(unit: Unit, presses: Sequence[Press], background: Tensor | None) -> Iterator[Row]:
-    """What stands before the first frame: import, calibration, the first frame; memory; and the delay behind a camera.
+    """What stands before the first frame: import, calibration, the first frame; and the delay behind a camera.
 
     The error "value" of a row is what ``method`` names, in the unit ``data``.
     """
@@ -115,8 +110,6 @@ def costs(unit: Unit, presses: Sequence[Press], background: Tensor | None) -> It
         DepthPipeline.from_calibration(unit.calibration).freeze()(unit.image)
 
     yield cost("first frame: the pipeline made, and its first depth", _s(first_frame), "s")
-    pipe = DepthPipeline.from_calibration(unit.calibration).freeze()
-    yield cost("largest memory of a frame's tensors", memory_mb(partial(pipe, unit.image)), "MB")
     background = unit.calibration.background.float().clamp(0.0, 1.0)
     pictures = [gs_sdk.image_to_bgr(image) for image in (background, unit.image[0])]
     found = measure_latency(unit.calibration, pictures, frames=CAMERA_FRAMES)
@@ -141,14 +134,13 @@ def _import_s() -> float:
     return statistics.median(float(done.stdout) for done in runs)
 
 
-def as_user(progress: Progress, data: Path | None, calls: int = 100, long: bool = False) -> list[Row]:
+def as_user(progress: Progress, data: Path | None, calls: int = 100) -> list[Row]:
     """Frames of all units, sizes, paces and threads, then costs.
 
     Args:
         progress: called with the name of what is measured next.
         data: folder with ``gelsight_mini_a``; None without: then the drawn rig alone.
         calls: number of calls of each row, at least 20.
-        long: 10,000 frames, every 20 ms, of the first unit at 320x240 too, for the 99th percentile: seven minutes more.
     """
     makers: list[Callable[[tuple[int, int]], Unit]] = [drawn] if data is None else [partial(mini, data), drawn]
     rows: list[Row] = []
@@ -165,12 +157,6 @@ def as_user(progress: Progress, data: Path | None, calls: int = 100, long: bool 
                 rows += frames(unit, calls)
                 torch.set_num_threads(allowed)
     unit = makers[0](SIZES[1])
-    if long:
-        progress("10,000 frames, every 20 ms")
-        for mode in USED:
-            call = partial(DepthPipeline.from_calibration(unit.calibration, mode).freeze(), unit.image)
-            times = in_turn([partial(time.sleep, CAMERA_S), call], 10_000)[1]
-            rows.append(Row("frame", mode, unit.name, size=Size(*SIZES[1]), time=time_of(times, PACES[1])))
     progress("calibration, first frame, delay behind a camera")
     background, presses = (None, []) if data is None else read_presses(data / "gelsight_mini_a")
     return rows + list(costs(unit, [press for press in presses if press.contact_radius_px is not None][:30], background))
@@ -201,43 +187,33 @@ def user_table(rows: Sequence[Row]) -> str:
     groups: dict[tuple[str, str, str, str], dict[str, Time]] = {}
     for row in own:
         known = groups.setdefault((row.data, size_text(row.size), row.method, _threads(row)), {})
-        if row.time is not None and (row.time.pace not in known or row.time.calls > known[row.time.pace].calls):
-            known[row.time.pace] = row.time
+        if row.time is not None:
+            known.setdefault(row.time.pace, row.time)
     lines = []
     for key, times in groups.items():
         cells = [_cell(times.get(pace)) for pace in PACES]
         lines.append([*key, *cells, number(1000.0 / times[PACES[0]].ms_median if PACES[0] in times else None, 0)])
-    titles = ["unit", "size", "method", "threads", *(f"{pace}: ms, median, p90 (p99)" for pace in PACES)]
+    titles = ["unit", "size", "method", "threads", *(f"{pace}: ms, median, p90" for pace in PACES)]
     paid = [[row.method, f"{row.errors['value']:.3g} {row.data}"] for row in rows if row.kind == "cost"]
     once = markdown(["what is paid once, or behind a camera", ""], paid)
     return "\n".join([markdown([*titles, "frames/s in a tight loop"], lines), "", *ratios(rows), "", once, "", machine()])
 
 
 def _cell(time: Time | None) -> str:
-    if time is None:
-        return ""
-    p99 = "" if time.ms_p99 is None else f" ({time.ms_p99:.2f} of {time.calls})"
-    return f"{time.ms_median:.2f}, {time.ms_p90:.2f}{p99}"
+    return "" if time is None else f"{time.ms_median:.2f}, {time.ms_p90:.2f}"
 
 
 # exported files
 
 
-def export_table(unit: Unit, formats: Sequence[str], calls: int) -> str:
-    """Median ms of a frame in the library and in exported files, in turn in one process."""
+def export_table(unit: Unit, calls: int) -> str:
+    """Median ms of a frame in the library and in a file of TorchScript, in turn in one process."""
     lines = []
     for mode in USED:
         pipe = DepthPipeline.from_calibration(unit.calibration, mode)
         with tempfile.TemporaryDirectory() as folder:
-            frames: list[Callable[[Tensor], object]] = [pipe.freeze(), *(_written(pipe, name, Path(folder)) for name in formats)]
-            every = in_turn([partial(frame, unit.image) for frame in frames], calls)
-        own, *others = map(statistics.median, every)
-        lines.append([mode, f"{own:.2f}", *(f"{other:.2f}, {other / own:.1f} times" for other in others)])
-    return markdown(["mode", "library", *formats], lines)
-
-
-def _written(pipe: DepthPipeline, name: str, folder: Path) -> Callable[[Tensor], object]:
-    """The file of a format, written and loaded."""
-    path = folder / export.FORMATS[name].file_name
-    export.FORMATS[name].write(pipe, path)
-    return LOADERS[name](str(path))
+            file = torch.jit.load(export.export_torchscript(pipe, Path(folder) / "pipeline.pt"))  # type: ignore[no-untyped-call]
+            every = in_turn([partial(pipe.freeze(), unit.image), partial(file, unit.image)], calls)
+        own, other = map(statistics.median, every)
+        lines.append([mode, f"{own:.2f}", f"{other:.2f}, {other / own:.1f} times"])
+    return markdown(["mode", "library", "torchscript"], lines)

@@ -152,7 +152,7 @@ def _plain_inverse(calibration: Calibration) -> Built:
 def _shadows(calibration: Calibration) -> Built:
     """Mode precise that settles what dark channels mean."""
     pipe = DepthPipeline.from_calibration(calibration, "precise")
-    pipe.refine = Shadows(pipe.refine, pipe.mm_per_pixel)  # type: ignore[assignment]
+    pipe.refine = Shadows(pipe.refine, pipe.mm_per_pixel)
     return Built(pipe.freeze(), parameters(calibration, "precise"))
 
 

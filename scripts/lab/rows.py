@@ -29,15 +29,13 @@ class Size:
 
 @dataclass(frozen=True)
 class Time:
-    """Time and memory of one frame.
+    """Time of one frame.
 
     Attributes:
         ms_median: median time, ms.
         ms_iqr: interquartile range of the time, ms.
         ms_p90: 90th percentile, ms.
-        ms_p99: 99th, ms; None for fewer than 500 calls.
         calls: number of calls that were timed.
-        memory_mb: largest memory that one call holds beside its inputs, MB; None if it was not measured.
         threads: number of threads that torch may use.
         machine: kind of processor, number of cores, version of torch.
         pace: what came before each call.
@@ -46,9 +44,7 @@ class Time:
     ms_median: float
     ms_iqr: float
     ms_p90: float
-    ms_p99: float | None
     calls: int
-    memory_mb: float | None
     threads: int
     machine: str
     pace: str

@@ -9,9 +9,9 @@ from torch import Tensor
 
 from torchvts.calibration import Press
 from torchvts.core.geometry import normal_from_gradient, pixel_grid_mm
-from torchvts.training.balls import RIM_PX, Truth, ball_truth, fit_sphere, label
+from torchvts.training.balls import RIM_PX, Truth, ball_truth, label
 
-from .metrics import mask_iou, normal_angle_deg
+from .metrics import fit_sphere, mask_iou, normal_angle_deg
 
 STRAY_RADII = 2.5
 """Contact that is found so many contact radii and more from the center of a ball is stray."""

@@ -1,7 +1,6 @@
 """Speed: methods with their errors, frames as a user runs them, what is paid once, and exported files."""
 
 import statistics
-import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -10,7 +9,6 @@ from pathlib import Path
 import torch
 
 from torchvts.calibration import Press, read_presses
-from torchvts.core.tables import number
 from torchvts.model import Sensor
 from torchvts.normals import NormalFromMLP
 from torchvts.pipeline import MODES, DepthOutput
@@ -39,27 +37,12 @@ Errors = Mapping[str, float | None]
 Progress = Callable[[str], None]
 
 
-def time_of(times: Sequence[float], pace: str = PACES[0], frames: int = 1, memory_mb: float | None = None) -> Time:
-    """The record of the times of calls, ms, each of so many frames; the 99th percentile from 500 calls on."""
+def time_of(times: Sequence[float], pace: str = PACES[0], frames: int = 1) -> Time:
+    """The record of the times of calls, ms, each of so many frames."""
     ordered = sorted(value / frames for value in times)
     low, middle, high = statistics.quantiles(ordered, n=4)
-    p99 = ordered[int(0.99 * len(ordered))] if len(ordered) >= 500 else None
     p90 = ordered[int(0.9 * len(ordered))]
-    return Time(middle, high - low, p90, p99, len(ordered), memory_mb, torch.get_num_threads(), machine(), pace)
-
-
-def memory_mb(call: Callable[[], object]) -> float:
-    """Largest memory of tensors that a call holds at any moment, MB, by the record of the allocator."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CPU], profile_memory=True) as profile:
-            call()
-    held = most = 0
-    for event in profile.profiler.kineto_results.events():
-        if event.name() == "[memory]":
-            held += event.nbytes()
-            most = max(most, held)
-    return most / 1e6
+    return Time(middle, high - low, p90, len(ordered), torch.get_num_threads(), machine(), pace)
 
 
 def ms(row: Row) -> float:
@@ -78,9 +61,7 @@ def methods(progress: Progress, data: Path | None) -> list[Row]:
     done = []
     for row, call in rows:
         progress(f"{row.method}, {row.data}")
-        with torch.inference_mode():
-            held = memory_mb(call)
-        done.append(replace(row, time=time_of(in_turn([call], 40)[0], memory_mb=held)))
+        done.append(replace(row, time=time_of(in_turn([call], 40)[0])))
     return done
 
 
@@ -150,21 +131,6 @@ def _ball_errors(reconstruct: Reconstruct, presses: Sequence[Press], mm_per_pixe
     return {"normal_deg": mean(s.normal_deg for s in scores), "rms_um": mean(s.relief_um for s in scores)}
 
 
-def peer_ratios(rows: Sequence[Row]) -> list[str]:
-    """Sentences by size: the fast frame compared with gs_sdk's pipeline, and precise compared with fast."""
-    lines = []
-    for height, width in SIZES:
-        times = {row.method: ms(row) for row in rows if row.kind == "scene" and row.size == Size(height, width)}
-        peer = times.get(GS_SDK)
-        if peer is not None and "fast" in times:
-            slower = times["precise"] / times["fast"]
-            lines.append(
-                f"{width}x{height}: fast {times['fast']:.2f} ms, {peer / times['fast']:.1f} times as fast as gs_sdk's pipeline "
-                f"({peer:.1f} ms); precise takes {slower:.2f} times as long"
-            )
-    return lines
-
-
 def front(rows: Sequence[Row], error: str) -> list[Row]:
     """The Pareto front of time and of an error ("rms_um", "normal_deg"), by rising time, of what has not seen the frames before."""
     known = sorted((ms(row), value, k) for k, row in enumerate(rows) if not row.seen and (value := row.error(error)) is not None)
@@ -183,7 +149,6 @@ COLUMNS = (
     Column("size", lambda row: size_text(row.size)),
     Column("ms, median (IQR)", lambda row: f"{row.time.ms_median:.2f} ({row.time.ms_iqr:.2f})" if row.time else ""),
     Column("frames/s", lambda row: f"{1000.0 / ms(row):.0f}" if row.time else ""),
-    Column("MB", lambda row: number(row.time.memory_mb, 0) if row.time else ""),
     error_column("normals deg", "normal_deg", 3),
     error_column("RMS um", "rms_um", 3),
     error_column("largest px", "largest_px", 3),
@@ -197,5 +162,5 @@ def size_text(size: Size | None) -> str:
 
 
 def methods_table(rows: Sequence[Row]) -> str:
-    """The table of methods, the machine, and what a frame takes against gs_sdk's."""
-    return "\n".join([records.table(rows, COLUMNS), "", f"{machine()}, float32", *peer_ratios(rows)])
+    """The table of methods, and the machine."""
+    return "\n".join([records.table(rows, COLUMNS), "", f"{machine()}, float32"])

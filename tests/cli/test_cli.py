@@ -47,7 +47,12 @@ def test_the_module_is_the_command_and_loads_no_more_than_it_needs():
     "arguments, message",
     [
         (["calibrat", "a.png"], "got 'calibrat': did you mean 'calibrate'?"),
-        (["pose", "a", "b", "--out", "c", "--calibraton", "d"], "unknown option '--calibraton': did you mean '--calibration'?"),
+        (["pose", "a", "b", "c", "--out", "d", "--netwrk", "e"], "unknown option '--netwrk': did you mean '--network'?"),
+        (
+            ["pose", "a.png", "b.png", "--out", "c"],
+            "expected a calibration file, an image, folder or video, and an image as reference",
+        ),
+        (["pose", "a.png", "b.ply", "--out", "c"], "expected two clouds and nothing beside them, got a.png, b.ply"),
         (["reconstruct", "a", "b", "--out", "c", "--mode", "presise"], "got 'presise': did you mean 'precise'?"),
         (["reconstruct", "a", "b", "--out", "c", "--format", "png"], "got 'png': did you mean 'png16'?"),
         (["reconstruct", "a", "b"], "the following arguments are required: --out"),
@@ -58,7 +63,8 @@ def test_the_module_is_the_command_and_loads_no_more_than_it_needs():
         (["calibrate", "a.png"], "expected either --sensor or --mm-per-pixel"),
         (["calibrate", "a.png", "--sensor", "digit", "--gamma", "2.2"], "--gamma: expected it beside --mm-per-pixel"),
         (["calibrate", "a.png", "--sensor", "digit", "--out", "unit.npz"], "expected a name ending in .safetensors"),
-        (["stream", "--source", "0"], "expected either --sensor or --calibration"),
+        (["stream", "0"], "expected a calibration file and an input, got 0: name both, or --sensor to calibrate"),
+        (["stream", "0", "1", "--sensor", "digit"], "expected one source, got 0, 1"),
         (["samples", "gelsight_maxi"], "did you mean 'gelsight_mini'?"),
     ],
 )

@@ -4,8 +4,8 @@ import pytest
 import torch
 
 import torchvts as vts
+from lab import metrics
 from torchvts.core.geometry import gradient_from_normal, normal_from_gradient, pixel_grid_mm
-from torchvts.training.balls import fit_sphere
 
 
 def flat(height, width):
@@ -81,7 +81,7 @@ def test_depth_and_gradient_of_a_pipeline_follow_the_same_conventions(ring, smal
     out = vts.DepthPipeline.from_calibration(vts.Calibration.from_lights(lights, small_sensor), "precise")(
         vts.scenes.render(scene, lights)
     )
-    fit = fit_sphere(out.depth_mm, 0.25, out.contact)
+    fit = metrics.fit_sphere(out.depth_mm, 0.25, out.contact)
     assert fit.center_mm == pytest.approx((5.0, -3.0, -9.0), abs=0.06)
     assert torch.equal(out.normal[:, 2] > 0, torch.ones_like(out.contact[:, 0]))
     assert torch.equal(out.normal, normal_from_gradient(out.gradient))

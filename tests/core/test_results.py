@@ -183,7 +183,7 @@ def test_a_network_takes_the_models_place(unit, source, tmp_path):
     for name in ("net.safetensors", "nnmodel.pth"):
         out = tmp_path / name.replace(".", "_")
         reconstruct_dataset(unit, source / "1.png", out, network=tmp_path / name, **options)
-        pipe = vts.DepthPipeline.from_gs_sdk(tmp_path / name, calibration.background.float(), calibration.sensor, "fast")
+        pipe = vts.DepthPipeline.from_gs_sdk(tmp_path / name, calibration.background.float(), calibration.sensor)
         with torch.inference_mode():
             expected = pipe(vts.read_image(source / "1.png")[None]).depth_mm
         assert torch.allclose(vts.read_result(out / "1.npz").depth_mm, expected, atol=1e-5)

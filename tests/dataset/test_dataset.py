@@ -1,4 +1,4 @@
-"""Large data sets: every frame once and the same, whatever the batch, the workers, the processes, and wherever a run was killed."""
+"""Large data sets: every frame once and the same, whatever the workers, the processes, and wherever a run was killed."""
 
 import contextlib
 import json
@@ -88,8 +88,8 @@ def wait_for(condition, process):
         time.sleep(0.02)
 
 
-def test_batch_and_workers_do_not_matter(unit, frames, whole, tmp_path):
-    reconstruct_dataset(unit, frames, tmp_path, batch=7, workers=2)
+def test_workers_do_not_matter(unit, frames, whole, tmp_path):
+    reconstruct_dataset(unit, frames, tmp_path, workers=2)
     assert contents(tmp_path) == whole
 
 
@@ -98,7 +98,7 @@ def test_batch_and_workers_do_not_matter(unit, frames, whole, tmp_path):
 def test_killed_processes_lose_nothing_and_the_next_run_goes_on(unit, frames, whole, tmp_path, killed):
     out = tmp_path / "out"
     launcher = () if killed == "the only" else TORCHRUN
-    first = started(launcher, unit, frames, "--out", out, "--batch", 2, "--workers", 0)
+    first = started(launcher, unit, frames, "--out", out, "--workers", 0)
     wait_for(lambda: finished(out) >= 20, first)
     processes = family(first.pid)
     for pid in [max(processes)] if killed == "one" else processes:
@@ -166,6 +166,8 @@ def test_other_settings_are_refused_and_overwrite_begins_anew(unit, tmp_path):
         with pytest.raises(ValueError, match="was begun with other settings") as caught:
             reconstruct_dataset(calibration, source, out, **options)
         assert part in str(caught.value)
+    with pytest.raises(ValueError, match=r"holds the results of .*, not of .*: give each input another --out"):
+        reconstruct_dataset(unit, fill(tmp_path / "second", ["b.png"]), out, mode="fast", pictures=False)
     report = reconstruct_dataset(unit, source, out, mode="precise", format="npy", pictures=False, overwrite=True)
     assert (report.rows, report.before) == (1, 0)
     assert sorted(contents(out)) == ["a_depth.npy", "frames.csv", "summary.json"]  # a.npz is gone

@@ -11,7 +11,7 @@ from lab.rows import Row, Size, Time
 
 
 def row(method, ms, rms_um, kind="scene", height=480, data="sphere R 10 mm, press 1 mm, noise 0.003"):
-    time = Time(ms, 0.1, ms, None, 40, 1.0, 1, "a machine", speed.PACES[0])
+    time = Time(ms, 0.1, ms, 40, 1, "a machine", speed.PACES[0])
     size = Size(height, height * 4 // 3)
     ours = method in METHODS and METHODS[method].ours
     return Row(kind, method, data, {"rms_um": rms_um, "normal_deg": rms_um}, size, time, ours=ours)
@@ -32,7 +32,7 @@ def test_scenes_are_timed_and_scored(monkeypatch):
     assert {*speed.TIMED} - {*by_name} <= {"fast, SciPy's DCT"}
     assert by_name["fast"].errors["rms_um"] < 0.1 * by_name["flat"].errors["rms_um"]
     assert by_name["fast"].parameters == 12 and by_name["flat"].parameters == 0 and not by_name["look-up table"].ours
-    assert speed.ms(by_name["fast"]) == 2.0 and by_name["fast"].time.memory_mb >= 0.0
+    assert speed.ms(by_name["fast"]) == 2.0
 
 
 def test_rows_come_back_from_json():
@@ -43,8 +43,7 @@ def test_rows_come_back_from_json():
 def test_the_table_has_a_line_for_each_row():
     lines = rows.table(ROWS, speed.COLUMNS).splitlines()
     assert len(lines) == 2 + len(ROWS) and len({line.count("|") for line in lines}) == 1
-    assert "| 640x480 | 1.00 (0.10) | 1000 | 1 | 3.000 | 3.000 |" in lines[2]
-    assert speed.peer_ratios(ROWS)[0].startswith("640x480: fast 1.00 ms, 9.0 times as fast as gs_sdk's pipeline (9.0 ms)")
+    assert "| 640x480 | 1.00 (0.10) | 1000 | 3.000 | 3.000 |" in lines[2]
     with pytest.raises(ValueError, match="row: expected one with a time"):
         speed.ms(dataclasses.replace(ROWS[0], time=None))
 

@@ -304,8 +304,6 @@ def test_from_gs_sdk_gives_the_network_its_own_images(tmp_path):
     block.blur_px = 2.0
     block.save(tmp_path / "blurred.safetensors")
     assert vts.DepthPipeline.from_gs_sdk(str(tmp_path / "blurred.safetensors"), flat_skin(), sensor).normals.blur_px == 2.0
-    with pytest.raises(ValueError, match="mode: 'precise'"):
-        vts.DepthPipeline.from_gs_sdk(tmp_path / "nnmodel.pth", flat_skin(), sensor, "precise")
 
 
 def test_from_gs_sdk_on_a_real_unit_equals_the_network(data, mini_presses):

@@ -79,9 +79,10 @@ def test_a_pose_and_a_track(places, run_script):
         cv2.imwrite(str(places / "film" / f"{k:02d}.png"), bgr(tiny_image(-1 - k if k < 13 else k)))
     found = []
     for name, options in (("beside", ()), ("on", ("--unit", "m"))):
-        unit, out = ("--calibration", places / f"{name}.safetensors"), ("--out", places / name, *options)
-        run_script("track", "--source", places / "film", *unit, *out, "--video", "none")
-        run_script("pose", places / "film" / "14.png", places / "film" / "13.png", *unit, *out, "--no-pictures", "--cloud", "ply")
+        unit, out = places / f"{name}.safetensors", ("--out", places / name, *options)
+        run_script("track", unit, places / "film", *out, "--video", "none")
+        images = (places / "film" / "14.png", places / "film" / "13.png")
+        run_script("pose", unit, *images, *out, "--no-pictures", "--cloud", "ply")
         pose = json.loads((places / name / "pose.json").read_text())
         with (places / name / "poses.csv").open(newline="") as file:
             rows = list(csv.DictReader(file))

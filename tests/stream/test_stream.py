@@ -26,7 +26,6 @@ from conftest import Frames, write_film
 import torchvts as vts
 from lab.latency import measure_latency
 from torchvts import stream as streams
-from torchvts.cli.stream import with_corners
 from torchvts.core.files import rgb_from_bgr
 from torchvts.pipeline import unit_pipeline
 from torchvts.stream.sources import times_file
@@ -236,25 +235,6 @@ def test_each_frame_is_measured_in_its_own_light(unit, small_press, brightness):
     assert stream.conditions.light[0, :, 0].tolist() == pytest.approx([brightness(39)] * 3, abs=0.02) and stream.doubt == ""
 
 
-@pytest.mark.long
-def test_a_held_contact_does_not_fade(unit):
-    calibration, camera = unit
-    pictures = (camera(1.0 if k >= 15 else 0.0) for k in range(315))
-    with streams.TactileStream(Frames(pictures), calibration) as stream:
-        frames = [(float(f.output.depth_mm.max()), int(f.output.contact.sum())) for f in stream]
-    first, last = np.mean(frames[15:25], 0), np.mean(frames[-10:], 0)
-    assert last == pytest.approx(first, rel=0.01)
-
-
-def test_dimming_while_a_contact_is_held_is_followed_around_it(unit):
-    calibration, camera = unit
-    pictures = (camera(1.0 if k >= 15 else 0.0, dimming(k)) for k in range(300))
-    with streams.TactileStream(Frames(pictures), calibration) as stream:
-        frames = [(float(f.output.depth_mm.max()), int(f.output.contact.sum())) for f in stream]
-    first, last = np.mean(frames[15:25], 0), np.mean(frames[-10:], 0)
-    assert last == pytest.approx(first, rel=0.03)
-
-
 def test_a_step_of_the_light_is_in_the_table_and_a_dead_led_is_in_doubt(unit):
     calibration, camera = unit
     dead = np.array([1.0, 1.0, 0.0])  # of blue, green, red
@@ -302,7 +282,7 @@ def test_unusable_frames_are_named_and_left_out(unit, run_stream, unit_file, tmp
     for k, (picture, _) in bad.items():
         cv2.imwrite(str(folder / f"{k:03d}.png"), picture)
     (folder / "019.png").write_bytes(b"no image")
-    done = run_stream("--source", folder, "--calibration", unit_file, "--out", tmp_path / "out", "--video", "none")
+    done = run_stream(unit_file, folder, "--out", tmp_path / "out", "--video", "none")
     assert done.returncode == 1, done.stderr
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert [number for number, _ in summary["left_out_because"]] == [14, 15, 16, 17, 18, 19, 21]
@@ -366,7 +346,7 @@ def test_both_scripts_give_the_same_depth_for_a_video(unit, run_stream, run_scri
     rig.save(tmp_path / "rig.yaml")
     sensor, saved = ("--sensor", tmp_path / "rig.yaml"), tmp_path / "unit.safetensors"
     options = ("--out", tmp_path / "stream", "--video", "none", "--save-calibration", saved)
-    done = run_stream("--source", video, *sensor, *options)
+    done = run_stream(video, *sensor, *options)
     assert done.returncode == 0, done.stderr
     by_sensor = run_script("reconstruct", video, *sensor, "--out", tmp_path / "sensor", "--no-pictures")
     by_file = run_script("reconstruct", saved, video, "--out", tmp_path / "file", "--no-pictures")
@@ -596,7 +576,7 @@ def test_a_video_that_does_not_fit_on_the_disk_is_an_error(tmp_path, suffix, sma
 
 def test_a_video_that_fails_is_told_and_the_figures_are_kept(run_stream, unit_file, video, tmp_path, small_files):
     with small_files(400_000):
-        done = run_stream("--source", video, "--calibration", unit_file, "--out", tmp_path, "--video", "avi")
+        done = run_stream(unit_file, video, "--out", tmp_path, "--video", "avi")
     assert done.returncode == 2 and "overlay.avi: cannot be written: " in done.stderr
     assert len((tmp_path / "frames.csv").read_text().splitlines()) == 36 and not (tmp_path / "overlay.avi").exists()
 
@@ -649,7 +629,7 @@ def unit_file(unit, tmp_path_factory):
 
 
 def test_the_script_writes_overlay_summary_and_frames(run_stream, unit_file, video, tmp_path):
-    done = run_stream("--source", video, "--calibration", unit_file, "--out", tmp_path, "--video", "avi")
+    done = run_stream(unit_file, video, "--out", tmp_path, "--video", "avi")
     assert done.returncode == 0, done.stderr
     assert "35 frames, 0 dropped" in done.stdout and re.search(
         r"^median ms: read [\d.]+, rectify .* write [\d.]+$", done.stdout, re.M
@@ -663,7 +643,7 @@ def test_the_script_writes_overlay_summary_and_frames(run_stream, unit_file, vid
 
 
 def test_track_writes_a_row_for_each_frame_after_the_reference(run_script, unit_file, video, tmp_path):
-    done = run_script("track", "--source", video, "--calibration", unit_file, "--out", tmp_path, "--video", "none")
+    done = run_script("track", unit_file, video, "--out", tmp_path, "--video", "none")
     assert done.returncode == 1 and "frame 15: the reference" in done.stdout, done.stderr
     assert "19 frames, 10 lost, 1 keyframe, 0 loops closed" in done.stdout
     with (tmp_path / "poses.csv").open(newline="") as file:
@@ -686,7 +666,7 @@ def test_track_writes_a_row_for_each_frame_after_the_reference(run_script, unit_
 
 def test_a_key_of_a_summary_has_one_meaning_in_all_commands(run_script, unit_file, video, tmp_path):
     for command in ("stream", "track"):
-        given = ("--source", video, "--calibration", unit_file, "--out", tmp_path / command, "--video", "none")
+        given = (unit_file, video, "--out", tmp_path / command, "--video", "none")
         assert run_script(command, *given).returncode in (0, 1)
     assert run_script("reconstruct", unit_file, video, "--out", tmp_path / "reconstruct", "--no-pictures").returncode == 0
     says = {name: json.loads((tmp_path / name / "summary.json").read_text()) for name in ("stream", "track", "reconstruct")}
@@ -707,7 +687,7 @@ def test_track_refuses_a_reference_that_cannot_be_used_and_counts_bad_frames(uni
     (tmp_path / "film").mkdir()
     for k in range(20):
         cv2.imwrite(str(tmp_path / "film" / f"{k:03d}.png"), camera(1.0 if k >= 15 else 0.0) * (k != 17))
-    call = ("track", "--source", tmp_path / "film", "--calibration", unit_file, "--out", tmp_path / "out", "--video", "none")
+    call = ("track", unit_file, tmp_path / "film", "--out", tmp_path / "out", "--video", "none")
     for arguments, error in (
         (("--reference", tmp_path / "film" / "017.png"), "017.png: the frame has one colour everywhere"),
         (("--threads", "0"), "--threads: expected at least 1, got 0"),
@@ -715,7 +695,7 @@ def test_track_refuses_a_reference_that_cannot_be_used_and_counts_bad_frames(uni
     ):
         done = run_script(*call, *arguments)
         assert done.returncode == 2 and error in done.stderr and not (tmp_path / "out").exists(), done.stderr
-    done = run_script("track", "--source", tmp_path / "none.avi", "--calibration", unit_file, "--out", unit_file)
+    done = run_script("track", unit_file, tmp_path / "none.avi", "--out", unit_file)
     assert done.returncode == 2 and "got that of a file" in done.stderr, done.stderr  # before the source is opened
     done = run_script(*call)
     assert done.returncode == 1 and "1 frame left out, named above" in done.stdout, done.stderr
@@ -725,8 +705,8 @@ def test_track_refuses_a_reference_that_cannot_be_used_and_counts_bad_frames(uni
 
 def test_bad_arguments_are_refused_in_a_sentence(run_stream, video, tmp_path):
     for arguments, part in (
-        (["--source", tmp_path / "none.avi", "--sensor", "tacto"], "source: "),
-        (["--source", video, "--sensor", "gelsight_wedge", "--corners", "1 2 3"], "corners: expected eight numbers"),
+        ([tmp_path / "none.avi", "--sensor", "tacto"], "source: "),
+        ([video, "--sensor", "gelsight_wedge", "--press", video, "wide"], "press: expected the diameter of the ball in mm"),
     ):
         done = run_stream(*arguments)
         assert done.returncode == 2 and done.stderr.startswith("torchvts: error: ") and part in done.stderr, done.stderr
@@ -744,7 +724,7 @@ def test_what_came_before_ctrl_c_is_kept(run_stream, unit_file, video, tmp_path,
 
     monkeypatch.setattr(streams.Overlay, "__call__", interrupted)
     before = signal.getsignal(number)
-    done = run_stream("--source", video, "--calibration", unit_file, "--out", tmp_path, "--video", "avi")
+    done = run_stream(unit_file, video, "--out", tmp_path, "--video", "avi")
     assert done.returncode == 0 and "interrupted" in done.stdout, done.stderr
     assert len(list(vts.frames(tmp_path / "overlay.avi"))) == 20
     assert not list(tmp_path.glob(".overlay*")) and (tmp_path / "summary.json").is_file()
@@ -763,10 +743,8 @@ def test_a_process_ended_in_the_middle_leaves_a_whole_video_or_none(unit, unit_f
         "-m",
         "torchvts",
         "stream",
-        "--source",
-        video,
-        "--calibration",
         unit_file,
+        video,
         "--out",
         out,
         "--realtime",
@@ -800,25 +778,13 @@ def test_the_golf_ball_appears_and_vanishes(data):
 
 def test_a_sensor_of_which_no_more_than_pitch_and_corners_is_known_is_told_what_to_press(data, run_stream, tmp_path):
     wedge = vts.Sensor.load("gelsight_wedge")
-    vts.Sensor("mine", 300, 400, 0.09, corners_px=wedge.corners_px).save(tmp_path / "mine.yaml")
+    vts.Sensor("mine", 150, 200, 0.18, corners_px=wedge.corners_px).save(tmp_path / "mine.yaml")
     video = next((data / "wedge_video").glob("*.avi"))
-    done = run_stream("--source", video, "--sensor", tmp_path / "mine.yaml")
+    done = run_stream(video, "--sensor", tmp_path / "mine.yaml")
     assert done.returncode == 2 and "calibration's background" not in done.stderr and "background-frames 0" not in done.stderr
     assert "how sensor 'mine' is lit cannot be found in its first 12 frames alone: press a ball of known diam" in done.stderr
-    done = run_stream("--source", video, "--sensor", tmp_path / "mine.yaml", "--device", "gpu")
+    done = run_stream(video, "--sensor", tmp_path / "mine.yaml", "--device", "gpu")
     assert done.returncode == 2 and "device: expected cpu, cuda" in done.stderr
-
-
-def test_corners_take_the_place_of_the_crop_of_raw_frames():
-    frame, mini = torch.rand(1, 3, 480, 640), vts.Sensor.load("gelsight_mini")
-    frame = torch.nn.functional.avg_pool2d(frame, 31, 1, 15)
-    (left, top), (right, bottom) = (91.0, 68.0), (548.0, 411.0)
-    cut = with_corners(mini, f"{left},{top} {right},{top} {right},{bottom} {left},{bottom}")
-    assert torch.allclose(cut.rectify(frame), mini.rectify(frame), atol=0.005)
-    lying, digit = frame[:, :, :240, :320], vts.Sensor.load("digit")  # the gel's top left is at the frame's top right
-    assert torch.allclose(with_corners(digit, "319 0 319 239 0 239 0 0").rectify(lying), digit.rectify(lying), atol=1e-5)
-    upright = digit.rectify(lying)
-    assert torch.allclose(with_corners(digit, "0 0 239 0 239 319 0 319").rectify(upright), upright, atol=1e-5)
 
 
 def test_a_narrow_image_can_be_a_background():
@@ -879,7 +845,7 @@ def test_a_raw_video_of_a_mini_runs_without_a_camera(data, run_stream, tmp_path,
     sequence = [(free + 0.6 * generator.standard_normal(free.shape)).clip(0, 255).round().astype(np.uint8) for _ in range(16)]
     sequence[14:14] = [pictures[k] for k in (0, 10, 20)]
     video = write_film(tmp_path / "raw.avi", [cv2.resize(picture, size) for picture in sequence])
-    done = run_stream("--source", video, "--sensor", "gelsight_mini", "--out", tmp_path / "out")
+    done = run_stream(video, "--sensor", "gelsight_mini", "--out", tmp_path / "out")
     assert done.returncode == 0, done.stderr
     rows = [row.split(",") for row in (tmp_path / "out" / "frames.csv").read_text().splitlines()[1:]]
     assert min(float(row[3]) for row in rows[14:17]) > 0.3 and max(float(row[3]) for row in rows[:14] + rows[17:]) < 0.02

@@ -42,7 +42,7 @@ def press(unit, tmp_path_factory):
     folder = tmp_path_factory.mktemp("view")
     calibration.save(folder / "unit.safetensors")
     write_film(folder / "press.avi", [camera(1.0 if k >= 14 else 0.0) for k in range(18)])
-    return ["--source", folder / "press.avi", "--calibration", folder / "unit.safetensors"]
+    return [folder / "unit.safetensors", folder / "press.avi"]
 
 
 def read_back(path):
@@ -256,7 +256,10 @@ def test_a_camera_is_named_by_index_path_or_device(tmp_path):
 
 def test_settings_of_no_camera_are_refused(press, run_script):
     done = run_script("stream", *press, "--fps", 30)
-    assert done.returncode == 2 and "--size, --fps, --exposure, --white-balance: expected a camera of this machine" in done.stderr
+    assert (
+        done.returncode == 2
+        and "settings: size, rate, exposure and white balance are those of a camera of this machine" in done.stderr
+    )
     with pytest.raises(OSError, match="expected a camera with index 97"):
         streams.Camera(97, streams.CameraSettings(fps=30.0))
 

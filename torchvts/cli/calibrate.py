@@ -48,7 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--out", type=Path, default=Path("unit.safetensors"), metavar="FILE", help="calibration to write (unit.safetensors)"
     )
-    parser.add_argument("--candidates", action="store_true", help="print every model that was fitted, and every press")
+    parser.add_argument("--candidates", action="store_true", help="also print all models that were tried, and all presses")
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -28,6 +28,33 @@ def add_sensor(parser: argparse._ActionsContainer, text: str = "") -> None:
     parser.add_argument("--sensor", metavar="NAME", help=f"{text}YAML file, or one of {', '.join(shipped_sensors())}")
 
 
+def add_unit(parser: argparse._ActionsContainer, inputs: str) -> None:
+    """The files of a command that reads frames: a calibration, then ``inputs``; or inputs alone, and ``--sensor`` calibrates."""
+    parser.add_argument("files", nargs="+", metavar="FILE", help=f"calibration, then {inputs}; with --sensor only these")
+    add_sensor(parser, "calibrate first: ")
+    parser.add_argument("--background", type=Path, nargs="+", metavar="IMAGE", help="to calibrate: without contact; or a video")
+    add_press(parser)
+    add_background_frames(parser)
+
+
+def split_files(arguments: argparse.Namespace) -> tuple[Sensor | Calibration, list[str]]:
+    """The unit and the inputs that the arguments of :func:`add_unit` name.
+
+    Raises:
+        UsageError: a calibration beside ``--sensor``, neither of both, no input, or what calibrates beside a calibration.
+    """
+    first, *inputs = arguments.files
+    if arguments.sensor is not None:
+        if first.endswith(".safetensors"):
+            raise UsageError(f"expected inputs only beside --sensor, which calibrates, got {first}: leave one of them out")
+        return load_sensor(arguments.sensor), arguments.files
+    if arguments.background or arguments.press:
+        raise UsageError("--background, --press: they are to calibrate with --sensor, not beside a calibration file")
+    if not inputs:
+        raise UsageError(f"expected a calibration file and an input, got {first}: name both, or --sensor to calibrate")
+    return load_calibration(Path(first)), inputs
+
+
 def add_press(parser: argparse._ActionsContainer) -> None:
     """``--press IMAGE DIAMETER_MM``, repeated."""
     parser.add_argument(
@@ -42,7 +69,7 @@ def add_background_frames(parser: argparse._ActionsContainer) -> None:
         type=int,
         default=FIRST_FRAMES,
         metavar="N",
-        help=f"first of a video, without contact ({FIRST_FRAMES})",
+        help=f"first frames, without contact ({FIRST_FRAMES})",
     )
 
 

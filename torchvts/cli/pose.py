@@ -1,11 +1,11 @@
 """Pose of a pressed object relative to a reference press: two frames, a sequence against a reference, or two clouds.
 
-SOURCE and REFERENCE are images, or clouds (.pcd, .ply); a folder of images or a video as SOURCE is followed frame by frame.
-Exit status 1 where a pose was not found.
+SOURCE and REFERENCE are images, and CALIBRATION is what torchvts calibrate wrote; a folder of images or a video as SOURCE is
+followed frame by frame. Two clouds (.pcd, .ply) need no calibration. Exit status 1 where a pose was not found.
 
 examples:
-  torchvts pose source.png reference.png --calibration unit.safetensors --out out/pose
-  torchvts pose video.avi reference.png --calibration unit.safetensors --out out/all
+  torchvts pose unit.safetensors source.png reference.png --out out/pose
+  torchvts pose unit.safetensors video.avi reference.png --out out/all
   torchvts pose source.ply reference.pcd --out out/pose
 """
 
@@ -27,8 +27,9 @@ from ..pose.clouds import CLOUD_SUFFIXES
 from ..pose.result import Registration
 from ..stream import FrameCheck, frames
 from .options import add_length_unit, add_mode, add_network, add_out, load_calibration
+from .parser import UsageError
 
-USAGE = "SOURCE REFERENCE [--calibration FILE] --out FOLDER"
+USAGE = "CALIBRATION SOURCE REFERENCE --out FOLDER"
 
 LEAST_MM, MOST_MM = 0.2, 2000.0
 """Extent of a cloud that a touch can be compared with; metres for millimetres, or the reverse, lie outside for 1 to 200 mm."""
@@ -36,9 +37,7 @@ LEAST_MM, MOST_MM = 0.2, 2000.0
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the subcommand."""
-    parser.add_argument("source", type=Path, metavar="SOURCE", help="image, cloud, folder of images, or video")
-    parser.add_argument("target", type=Path, metavar="REFERENCE", help="image or cloud")
-    parser.add_argument("--calibration", type=Path, metavar="FILE", help="what torchvts calibrate wrote; not needed for clouds")
+    parser.add_argument("files", type=Path, nargs="+", metavar="FILE", help="calibration, source, reference; or two clouds")
     add_out(parser, "for pose.json and pictures")
     add_mode(parser)
     add_network(parser)
@@ -49,11 +48,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Find the poses, write pose.json, and print them."""
-    clouds = [path.suffix.lower() in CLOUD_SUFFIXES for path in (arguments.source, arguments.target)]
-    if any(clouds) and not all(clouds):
-        raise ValueError("source and target: expected two images or two clouds, got one of each")
+    clouds = [path.suffix.lower() in CLOUD_SUFFIXES for path in arguments.files]
+    if any(clouds) and (not all(clouds) or len(clouds) != 2):
+        raise UsageError(f"expected two clouds and nothing beside them, got {', '.join(map(str, arguments.files))}")
+    if not any(clouds) and len(clouds) != 3:
+        names = ", ".join(map(str, arguments.files))
+        raise UsageError(f"expected a calibration file, an image, folder or video, and an image as reference, got {names}")
     make_folder(arguments.out)
-    results = of_clouds(arguments) if all(clouds) else of_frames(arguments)
+    results = of_clouds(arguments, *arguments.files) if all(clouds) else of_frames(arguments, *arguments.files)
     with write_atomically(arguments.out / "pose.json") as temporary:
         temporary.write_text(json.dumps(results if len(results) > 1 else results[0], indent=1) + "\n")
     without = [result for result in results if not result["converged"]]
@@ -63,12 +65,12 @@ def run(arguments: argparse.Namespace) -> int:
     return 1 if without else 0
 
 
-def of_clouds(arguments: argparse.Namespace) -> list[dict[str, Any]]:
+def of_clouds(arguments: argparse.Namespace, source_file: Path, target_file: Path) -> list[dict[str, Any]]:
     """Register two clouds."""
-    (source, source_normals), (target, target_normals) = (read_point_cloud(p) for p in (arguments.source, arguments.target))
+    (source, source_normals), (target, target_normals) = (read_point_cloud(path) for path in (source_file, target_file))
     frame = OutputFrame(arguments.length_unit)
     source, target = frame.mm * source, frame.mm * target
-    for path, points in ((arguments.source, source), (arguments.target, target)):
+    for path, points in ((source_file, source), (target_file, target)):
         width_mm = float((points.amax(0) - points.amin(0)).max())
         if not LEAST_MM <= width_mm <= MOST_MM:
             raise ValueError(
@@ -76,16 +78,14 @@ def of_clouds(arguments: argparse.Namespace) -> list[dict[str, Any]]:
                 f"--unit m reads them so, this was read as {arguments.length_unit}"
             )
     found = register_points(source, target, source_normals=source_normals, target_normals=target_normals)
-    print_result(arguments.source.stem, found)
-    draw(arguments, arguments.source.stem, source, target, found, frame)
-    return [record(arguments.source.stem, found, frame)]
+    print_result(source_file.stem, found)
+    draw(arguments, source_file.stem, source, target, found, frame)
+    return [record(source_file.stem, found, frame)]
 
 
-def of_frames(arguments: argparse.Namespace) -> list[dict[str, Any]]:
+def of_frames(arguments: argparse.Namespace, unit: Path, source: Path, reference: Path) -> list[dict[str, Any]]:
     """Register every frame with the reference."""
-    if arguments.calibration is None:
-        raise ValueError("--calibration: expected what torchvts calibrate wrote, for images must become depth first")
-    calibration = load_calibration(arguments.calibration)
+    calibration = load_calibration(unit)
     pipe = unit_pipeline(calibration, arguments.mode, arguments.network).requires_grad_(False).freeze()
     pitch, check = calibration.sensor.mm_per_pixel, FrameCheck.from_calibration(calibration)
     written = OutputFrame(arguments.length_unit, calibration.sensor)
@@ -98,14 +98,14 @@ def of_frames(arguments: argparse.Namespace) -> list[dict[str, Any]]:
         return pipe(image)
 
     try:
-        target = depth_of(read_image(arguments.target))
+        target = depth_of(read_image(reference))
         target_points = contact_cloud(target, pitch, 4000)[0]
     except ValueError as error:
         raise ValueError(f"reference: {str(error).removeprefix('frame: ')}") from error
     results: list[dict[str, Any]] = []
     last = None
-    count = count_frames(arguments.source)
-    for name, image in tqdm(frames(arguments.source), total=count, unit="frame", disable=None):
+    count = count_frames(source)
+    for name, image in tqdm(frames(source), total=count, unit="frame", disable=None):
         try:
             frame = depth_of(image)
             found = register_depth(frame, target, pitch, initial=last)

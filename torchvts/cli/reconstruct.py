@@ -20,28 +20,17 @@ from tqdm import tqdm
 
 from ..core.files import make_folder
 from ..core.recordings import is_film
-from ..dataset import CLOUD_FORMATS, FORMATS, PICTURES_UP_TO, Report, list_items, reconstruct_dataset
+from ..dataset import CLOUD_FORMATS, FORMATS, PICTURES_UP_TO, RunReport, list_items, reconstruct_dataset
 from ..diagnose import Finding, diagnose
-from ..model import Calibration
+from ..model import Calibration, Sensor
 from ..model.report import warnings_of
 from ..model.summary import NOT_METRIC, SHOWN, doubts_of
 from ..stream import frames, read_background, read_press_images
-from .options import (
-    add_background_frames,
-    add_length_unit,
-    add_out,
-    add_pipeline,
-    add_press,
-    add_sensor,
-    calibrated,
-    contact_of,
-    load_calibration,
-    load_sensor,
-)
+from .options import add_length_unit, add_out, add_pipeline, add_unit, calibrated, contact_of, split_files
 from .parser import UsageError
 
 PASSED = (
-    "mode", "format", "cloud", "length_unit", "pictures", "every", "network", "device", "background_frames", "batch", "workers",
+    "mode", "format", "cloud", "length_unit", "pictures", "every", "network", "device", "background_frames", "workers",
     "threads", "overwrite", "strict",
 )  # fmt: skip
 """Options that :func:`reconstruct_dataset` has under the same names."""
@@ -54,20 +43,15 @@ USAGE = "CALIBRATION INPUT... --out FOLDER"
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the subcommand."""
-    parser.add_argument("files", type=Path, nargs="+", metavar="FILE", help="the calibration, then inputs; with --sensor inputs")
+    add_unit(parser, "inputs")
     add_out(parser, "for the results, in the folders of the input")
-    add_sensor(parser, "calibrate first: ")
-    parser.add_argument("--background", type=Path, nargs="+", metavar="IMAGE", help="to calibrate: without contact; or a video")
-    add_press(parser)
-    add_background_frames(parser)
     add_pipeline(parser)
     parser.add_argument("--every", type=int, default=1, metavar="N", help="each N-th frame of a video, each N-th image")
     kinds = "npz (all), video-npz (one a video), png16, npy, none (npz)"
     parser.add_argument("--format", choices=FORMATS, default="npz", metavar="KIND", help=kinds)
     parser.add_argument("--cloud", choices=CLOUD_FORMATS, default="none", metavar="KIND", help="contact: ply, pcd, obj (surface)")
     add_length_unit(parser)
-    parser.add_argument("--pictures", action=argparse.BooleanOptionalAction, help=f"drawn for at most {PICTURES_UP_TO} frames")
-    parser.add_argument("--batch", type=int, default=8, metavar="N", help="frames that a loader hands over at once (8)")
+    parser.add_argument("--pictures", action=argparse.BooleanOptionalAction, help=f"of each frame (of {PICTURES_UP_TO} at most)")
     parser.add_argument("--workers", type=int, metavar="N", help="loader processes of each rank (up to 4)")
     parser.add_argument("--threads", type=int, default=1, metavar="N", help="of each rank (1); results vary in last bits")
     parser.add_argument("--overwrite", action="store_true", help="begin anew, whatever --out holds")
@@ -76,14 +60,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Reconstruct, and print a summary."""
-    calibration, inputs = split_files(arguments)
-    if calibration is None:
-        calibration = calibrate_first(arguments, inputs)
+    unit, names = split_files(arguments)
+    inputs = [Path(name) for name in names]
+    calibration = Path(arguments.files[0])
+    if isinstance(unit, Sensor):
+        calibration, unit = calibrate_first(arguments, inputs, unit)
     passed = {name: getattr(arguments, name) for name in PASSED}
     report = reconstruct_dataset(calibration, inputs, arguments.out, contact=contact_of(arguments.contact), **passed)
     if report.rank > 0:
         return 0
-    unit = load_calibration(calibration)
     print_report(report, arguments.out, unit.metric)
     if arguments.sensor is None:  # else said where it was calibrated
         print_unit(unit)
@@ -95,36 +80,20 @@ def run(arguments: argparse.Namespace) -> int:
     return 1 if report.failed or report.doubted or any(finding.severity == "fault" for _, finding in findings) else 0
 
 
-def split_files(arguments: argparse.Namespace) -> tuple[Path | None, list[Path]]:
-    """The calibration, if it is named, and the inputs."""
-    files = list(arguments.files)
-    if arguments.sensor is not None:
-        if files[0].suffix == ".safetensors":
-            raise UsageError(f"expected inputs only beside --sensor, which calibrates, got {files[0]}: leave one of them out")
-        return None, files
-    if arguments.background or arguments.press:
-        raise UsageError("--background, --press: they are to calibrate with --sensor, not beside a calibration file")
-    if len(files) < 2:
-        raise UsageError(f"expected a calibration file and an input, got {files[0]}: name both, or --sensor to calibrate")
-    load_calibration(files[0])
-    return files[0], files[1:]
-
-
-def calibrate_first(arguments: argparse.Namespace, inputs: list[Path]) -> Path:
+def calibrate_first(arguments: argparse.Namespace, inputs: list[Path], unit: Sensor) -> tuple[Path, Calibration]:
     """Calibrate as ``torchvts stream`` does, and keep the file with the results."""
     if int(os.environ.get("WORLD_SIZE", "1")) > 1:
         raise UsageError("--sensor: expected one process, got more: calibrate first, by torchvts calibrate, and give the file")
     video = next((path for path in inputs if is_film(path)), None)
     if arguments.background is None and video is None:
         raise UsageError(f"--background: expected images without contact, got none: {inputs[0]} is no video that begins with them")
-    unit = load_sensor(arguments.sensor)
     image = read_background(arguments.background or [video], unit, arguments.background_frames)
     calibration = calibrated(image, unit, read_press_images(arguments.press, unit))
     print(calibration)
     path: Path = arguments.out / "calibration.safetensors"
     make_folder(path.parent)
     calibration.save(path)
-    return path
+    return path, calibration
 
 
 def print_unit(unit: Calibration) -> None:
@@ -135,7 +104,7 @@ def print_unit(unit: Calibration) -> None:
         print(*doubts_of(unit.report), sep="\n")
 
 
-def print_report(report: Report, out: Path, metric: bool) -> None:
+def print_report(report: RunReport, out: Path, metric: bool) -> None:
     """Print the deepest frames, how many were left out, which are in doubt, and where the results are."""
     with (out / "frames.csv").open(encoding="utf-8", errors="replace", newline="") as stream:
         rows = list(csv.DictReader(stream))
@@ -159,7 +128,7 @@ def print_report(report: Report, out: Path, metric: bool) -> None:
     print(f"wrote {frames} to {out}{before}; table in frames.csv, units in summary.json")
 
 
-def diagnose_some(unit: Calibration, inputs: list[Path], report: Report, every: int) -> list[tuple[str, Finding]]:
+def diagnose_some(unit: Calibration, inputs: list[Path], report: RunReport, every: int) -> list[tuple[str, Finding]]:
     """What is wrong with :data:`DIAGNOSED` images, and the first frame of each video; frames that were left out are not asked.
 
     A finding is given once, with its first frame and how many more have it. Of a frame in doubt only faults are given.

@@ -12,22 +12,26 @@ import torch
 from ..calibration import Press
 from ..core.checks import check_integer
 from ..model import Calibration, Sensor
-from ..stream import Camera, CameraSettings, Recorder, TactileFrame, TactileStream, find_camera
+from ..stream import (
+    CameraSettings,
+    Recorder,
+    TactileFrame,
+    TactileStream,
+    read_background,
+    read_press_images,
+)
 from ..stream.sources import FileReader
-from .options import add_background_frames, add_pipeline, add_sensor, contact_of, load_calibration, load_sensor
+from .options import add_pipeline, add_unit, calibrated, contact_of, split_files
 from .parser import UsageError
 
 
 def add_source(parser: argparse.ArgumentParser) -> None:
     """Options of the source, the unit, the camera and the pipeline."""
-    parser.add_argument("--source", required=True, help="camera (index, path, name, serial), video, folder, URL")
+    add_unit(parser, "a camera, video, folder or URL")
     parser.add_argument("--size", nargs=2, type=int, metavar=("W", "H"), help="of a camera's frames, where the driver takes it")
     parser.add_argument("--fps", type=float, metavar="F", help="of a camera, where the driver takes it")
     parser.add_argument("--exposure", type=float, metavar="E", help="of a camera, driver's unit; ends automatic exposure")
     parser.add_argument("--white-balance", type=float, metavar="K", help="of a camera, kelvin; ends automatic white balance")
-    add_sensor(parser, "the first frames calibrate: ")
-    parser.add_argument("--calibration", type=Path, metavar="FILE", help="what torchvts calibrate wrote, in place of --sensor")
-    add_background_frames(parser)
     add_pipeline(parser)
     parser.add_argument("--record", type=Path, metavar="PATH", help="of a camera's raw frames: .mkv, or a folder (PNG)")
     parser.add_argument("--realtime", action="store_true", help="play a recording at its own rate, dropping late frames")
@@ -40,25 +44,28 @@ def add_video(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--video", choices=["webm", "mp4", "avi", "none"], default="webm", metavar="KIND", help=kinds)
 
 
-def load_unit(arguments: argparse.Namespace) -> Sensor | Calibration:
-    """The sensor or the calibration that was given, and the threads that were asked for."""
-    if (arguments.sensor is None) == (arguments.calibration is None):
-        raise UsageError("expected either --sensor or --calibration")
+def load_unit(arguments: argparse.Namespace) -> tuple[Sensor | Calibration, str]:
+    """The sensor or the calibration that was given, and the source; sets the threads that were asked for."""
+    unit, sources = split_files(arguments)
+    if len(sources) > 1:
+        raise UsageError(f"expected one source, got {', '.join(sources)}")
     check_integer("--threads", arguments.threads, 1)
     torch.set_num_threads(arguments.threads)
     cv2.setNumThreads(arguments.threads)
-    return load_sensor(arguments.sensor) if arguments.sensor else load_calibration(arguments.calibration)
+    return unit, sources[0]
 
 
-def open_stream(arguments: argparse.Namespace, unit: Sensor | Calibration, presses: Sequence[Press] = ()) -> TactileStream:
+def open_stream(arguments: argparse.Namespace, unit: Sensor | Calibration, source: str) -> TactileStream:
     """The stream of the source; says what it found."""
     started = time.perf_counter()
-    settings = CameraSettings(arguments.size and tuple(arguments.size), arguments.fps, arguments.exposure, arguments.white_balance)
-    camera = find_camera(arguments.source)
-    if settings.given and camera is None:
-        raise UsageError(f"--size, --fps, --exposure, --white-balance: expected a camera of this machine, got {arguments.source!r}")
+    presses: Sequence[Press] = ()
+    if isinstance(unit, Sensor):
+        presses = read_press_images(arguments.press, unit)
+        if arguments.background:
+            image = read_background(arguments.background, unit, arguments.background_frames)
+            unit, presses = calibrated(image, unit, presses), ()
     stream = TactileStream(
-        arguments.source if camera is None or not settings.given else Camera(camera, settings),
+        source,
         unit,
         mode=arguments.mode,
         background_frames=arguments.background_frames,
@@ -68,6 +75,9 @@ def open_stream(arguments: argparse.Namespace, unit: Sensor | Calibration, press
         device=arguments.device,
         contact=contact_of(arguments.contact),
         record=arguments.record,
+        settings=CameraSettings(
+            arguments.size and tuple(arguments.size), arguments.fps, arguments.exposure, arguments.white_balance
+        ),
     )
     first = arguments.background_frames
     note = f"the first {first} are without contact" if first else "the calibration's background is used as it is"

@@ -4,72 +4,42 @@ The first frames must be without contact. Ctrl-C ends it and finishes the files.
 or is in doubt.
 
 examples:
-  torchvts stream --source 0 --sensor gelsight_mini
-  torchvts stream --source video.avi --sensor gelsight_wedge --out out/ball
-  torchvts stream --source folder/ --calibration unit.safetensors --out out/run
+  torchvts stream 0 --sensor gelsight_mini
+  torchvts stream video.avi --sensor gelsight_wedge --out out/ball
+  torchvts stream unit.safetensors folder/ --out out/run
 """
 
 import argparse
 import contextlib
-import dataclasses
-from collections.abc import Sequence
 from pathlib import Path
 
-from ..calibration import Press
 from ..core.files import check_target, make_folder
-from ..model import Calibration, Sensor
-from ..stream import (
-    Overlay,
-    Sheet,
-    StreamReport,
-    TactileFrame,
-    TactileStream,
-    VideoFile,
-    read_background,
-    read_press_images,
-)
+from ..stream import Overlay, Sheet, StreamReport, TactileFrame, TactileStream, VideoFile
 from ..viz import save_figure
-from .options import add_press, calibrated
-from .parser import UsageError
 from .source import add_source, add_video, load_unit, open_stream, play
 
-USAGE = "--source SOURCE (--sensor NAME | --calibration FILE) [--out FOLDER]"
+USAGE = "CALIBRATION SOURCE [--out FOLDER]"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the subcommand."""
     add_source(parser)
-    parser.add_argument("--background", type=Path, nargs="+", metavar="IMAGE", help="to calibrate: without contact; or a video")
-    add_press(parser)
     parser.add_argument("--save-calibration", type=Path, metavar="FILE", help="write the calibration, .safetensors")
-    parser.add_argument(
-        "--corners",
-        help='of the gel in place of the sensor\'s: "x y x y x y x y", from top left, clockwise; straightened first',
-    )
     parser.add_argument("--out", type=Path, metavar="FOLDER", help="for overlay video, sheet.png, frames.csv and summary.json")
     add_video(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Stream until the source ends, and print a summary."""
-    unit = load_unit(arguments)
-    if arguments.calibration is not None and (arguments.background or arguments.press):
-        raise UsageError("--background, --press: they are to calibrate with --sensor, not beside --calibration")
-    if arguments.corners is not None:
-        unit = with_corners(unit, arguments.corners)
+    unit, source = load_unit(arguments)
     if arguments.save_calibration is not None:
         check_target(arguments.save_calibration)
     if arguments.out is None:
         print("give --out for an overlay video and files; torchvts view shows the stream live")
     else:
         make_folder(arguments.out)
-    presses: Sequence[Press] = ()
-    if isinstance(unit, Sensor):
-        presses = read_press_images(arguments.press, unit)
-    if isinstance(unit, Sensor) and arguments.background:
-        unit, presses = calibrated(read_background(arguments.background, unit, arguments.background_frames), unit, presses), ()
     with contextlib.ExitStack() as stack:
-        stream = stack.enter_context(open_stream(arguments, unit, presses))
+        stream = stack.enter_context(open_stream(arguments, unit, source))
         if arguments.save_calibration is not None:
             stream.calibration.save(arguments.save_calibration)
             print(f"wrote {arguments.save_calibration}")
@@ -109,18 +79,3 @@ class _Files:
                     self.video.write(picture)
             self.shown = frame.number
         return True
-
-
-def with_corners(unit: Sensor | Calibration, text: str) -> Sensor | Calibration:
-    """The sensor or calibration with other corners, of the gel in frames as they come (straightened, if it has a lens): they turn
-    and mirror these too."""
-    try:
-        numbers = [float(part) for part in text.replace(",", " ").split()]
-    except ValueError:
-        numbers = []
-    if len(numbers) != 8:
-        raise ValueError(f"corners: expected eight numbers, x and y of four corners, got {text!r}")
-    sensor = unit if isinstance(unit, Sensor) else unit.sensor
-    corners = tuple(zip(numbers[::2], numbers[1::2]))
-    sensor = dataclasses.replace(sensor, corners_px=corners, roi_px=None, raw_size_px=(), raw_crop=0.0, turn_deg=0, mirror=False)
-    return sensor if isinstance(unit, Sensor) else dataclasses.replace(unit, sensor=sensor)

@@ -2,13 +2,12 @@
 
 The first frames must be without contact. The reference is the first frame with a contact of --least-mm2, or the image --reference.
 Writes poses.csv (a pose a frame, standard deviations in mm and degrees, what is unknown, why it was lost), summary.json and a
-video with the axes of the reference on the image. --view shows surface and axes in 3D while they come, --save FILE.rrd records
-that. Ctrl-C ends it and finishes the files. Exit status 1 where the object was lost or a frame was left out.
+video with the axes of the reference on the image. Ctrl-C ends it and finishes the files. Exit status 1 where the object was lost
+or a frame was left out.
 
 examples:
-  torchvts track --source video.avi --sensor gelsight_wedge --out out/track
-  torchvts track --source 0 --calibration unit.safetensors \\
-      --out out/track --reference press.png
+  torchvts track video.avi --sensor gelsight_wedge --out out/track
+  torchvts track unit.safetensors 0 --out out/track --reference press.png
 """
 
 import argparse
@@ -39,7 +38,7 @@ from .options import add_length_unit, add_out
 from .parser import UsageError
 from .source import add_source, add_video, load_unit, open_stream, play
 
-USAGE = "--source SOURCE (--sensor NAME | --calibration FILE) --out FOLDER"
+USAGE = "CALIBRATION SOURCE --out FOLDER"
 
 COLUMNS = ("frame", "time_s", *(f"T{row}{column}" for row in range(3) for column in range(4)))
 QUALITY = (
@@ -69,9 +68,9 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.save is not None and arguments.save.suffix.lower() != ".rrd":
         raise UsageError(f"--save: expected a name ending in .rrd, got {arguments.save.name!r}: the video is written to --out")
     reference = None if arguments.reference is None else read_image(arguments.reference)
-    unit = load_unit(arguments)
+    unit, source = load_unit(arguments)
     with contextlib.ExitStack() as stack:
-        stream = stack.enter_context(open_stream(arguments, unit))
+        stream = stack.enter_context(open_stream(arguments, unit, source))
         tracker = None if reference is None else _tracker_of_image(stream, arguments.reference, reference)
         make_folder(arguments.out)
         video = None
@@ -192,7 +191,7 @@ def _tracker_of_image(stream: TactileStream, path: Path, image: Tensor) -> PoseT
     if reason:
         raise ValueError(f"reference: {path}: {reason}")
     with torch.inference_mode():
-        return PoseTracker(stream.pipe(image), _pitch(stream))
+        return PoseTracker(stream.recording.pipe(image), _pitch(stream))
 
 
 def summary(tracking: _Tracking, stream: TactileStream) -> dict[str, Any]:

@@ -5,9 +5,9 @@ opens it anywhere. Keys, in this terminal (or letters on standard input): z re-z
 r start and end a recording, q end.
 
 examples:
-  torchvts view --source 0 --sensor gelsight_mini
-  torchvts view --source /dev/video2 --calibration unit.safetensors --fps 30
-  torchvts view --source video.avi --sensor gelsight_wedge --save ball.rrd
+  torchvts view 0 --sensor gelsight_mini
+  torchvts view unit.safetensors /dev/video2 --fps 30
+  torchvts view video.avi --sensor gelsight_wedge --save ball.rrd
 """
 
 import argparse
@@ -21,7 +21,7 @@ from ..viz import depth_figure, save_figure
 from .parser import UsageError
 from .source import add_source, load_unit, open_stream, play
 
-USAGE = "--source SOURCE (--sensor NAME | --calibration FILE) [--save FILE.rrd]"
+USAGE = "CALIBRATION SOURCE [--save FILE.rrd]"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -43,8 +43,7 @@ def run(arguments: argparse.Namespace) -> int:
     require_rerun()
     if arguments.save is None and not has_screen():
         raise UsageError("expected --save FILE.rrd, for this machine has no screen that the viewer could open on")
-    unit = load_unit(arguments)
-    with open_stream(arguments, unit) as stream:
+    with open_stream(arguments, *load_unit(arguments)) as stream:
         pitch = stream.calibration.sensor.mm_per_pixel
         view = LiveView(
             pitch, stream.metric, save=arguments.save, viewer=arguments.save is None, exaggeration=arguments.exaggeration

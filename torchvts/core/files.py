@@ -189,18 +189,20 @@ def _check_still(path: Path) -> None:
         raise ValueError(f"{path}: expected an image of 8 bits a channel, got a GIF, which keeps 256 colours: {remedy}")
     if (head[8:16] == b"WEBPVP8X" and head[20] & 2) or b"acTL" in head:
         raise ValueError(f"{path}: expected one image, got an animation: {remedy}")
-    if path.suffix.lower() in PAGED_SUFFIXES and (count := len(page_places(path))) > 1:
+    if (count := count_pages(path)) > 1:
         raise ValueError(f"{path}: expected one image, got a TIFF of {count} pages: vts.frames and torchvts reconstruct take all")
 
 
-def page_places(path: Path) -> list[int]:
-    """Where the pages of a TIFF begin; the last one is missing where the file is cut short. [] for other files."""
+def count_pages(path: Path) -> int:
+    """Number of pages that a TIFF announces, of which the last may be cut short; 1 for other files."""
+    if path.suffix.lower() not in PAGED_SUFFIXES or not path.is_file():
+        return 1
     found: list[int] = []
     with path.open("rb") as stream:
         head = stream.read(16)
         order, size = {b"II": "<", b"MM": ">"}.get(head[:2], ""), path.stat().st_size
         if not order or len(head) < 16 or struct.unpack(f"{order}H", head[2:4])[0] not in (42, 43):
-            return found
+            return 1
         large = struct.unpack(f"{order}H", head[2:4])[0] == 43  # BigTIFF
         number, entry, pointer = ("Q", 20, "Q") if large else ("H", 12, "I")
         (place,) = struct.unpack_from(f"{order}{pointer}", head, 8 if large else 4)
@@ -215,7 +217,7 @@ def page_places(path: Path) -> list[int]:
             if len(following) < struct.calcsize(pointer):
                 break
             (place,) = struct.unpack(f"{order}{pointer}", following)
-    return found
+    return max(1, len(found))
 
 
 def check_colour(pixels: np.ndarray[Any, Any] | None, path: Path) -> np.ndarray[Any, Any]:

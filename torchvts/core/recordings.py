@@ -12,11 +12,10 @@ import numpy as np
 from .files import (
     IMAGE_SUFFIXES,
     IN_COLOUR,
-    PAGED_SUFFIXES,
     VIDEO_SUFFIXES,
     check_colour,
     check_text_name,
-    page_places,
+    count_pages,
     read_pixels,
 )
 
@@ -64,8 +63,8 @@ def raw_frames(source: str | Path) -> Iterator[RawFrame]:
 def _of_file(path: Path) -> Iterator[RawFrame]:
     if path.suffix.lower() in VIDEO_SUFFIXES:
         return _of_video(path)
-    if is_film(path):
-        return _of_pages(path)
+    if (count := count_pages(path)) > 1:
+        return _of_pages(path, count)
     return iter([RawFrame(path.stem, lambda: read_pixels(path))])
 
 
@@ -88,10 +87,10 @@ def _of_video(path: Path) -> Iterator[RawFrame]:
         raise ValueError(f"{path}: not a video, or cut short: no frame could be read")
 
 
-def _of_pages(path: Path) -> Iterator[RawFrame]:
+def _of_pages(path: Path, count: int) -> Iterator[RawFrame]:
     import cv2
 
-    data, count = np.fromfile(path, np.uint8), len(page_places(path))
+    data = np.fromfile(path, np.uint8)
     pages: list[Pixels] = []
     for number in range(count):
         if number % PAGES == 0:
@@ -103,8 +102,7 @@ def _of_pages(path: Path) -> Iterator[RawFrame]:
 
 def is_film(path: Path) -> bool:
     """Whether a file has frames with numbers: a video, or a TIFF of several pages."""
-    suffix = path.suffix.lower()
-    return suffix in VIDEO_SUFFIXES or (suffix in PAGED_SUFFIXES and path.is_file() and len(page_places(path)) > 1)
+    return path.suffix.lower() in VIDEO_SUFFIXES or count_pages(path) > 1
 
 
 def natural_order(name: str) -> tuple[list[str | Decimal], str]:
@@ -136,7 +134,7 @@ def count_frames(source: str | Path) -> int:
             return max(0, int(open_video(path).get(cv2.CAP_PROP_FRAME_COUNT)))
         except ValueError:  # its name
             return 1
-    return len(page_places(path)) if is_film(path) else 1
+    return count_pages(path)
 
 
 def cut_short(path: Path, count: int) -> str:

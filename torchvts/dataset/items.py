@@ -14,6 +14,13 @@ from ..core.recordings import count_frames, is_film, natural_order
 STATE = ".torchvts"
 """Folder inside the results that holds the settings and one record per frame; a folder that has one is never read as a source."""
 
+PARTS = "parts"
+"""Folder beside the records where the frames of a video wait until it is done."""
+
+VIDEO_FORMAT = "video-npz"
+FORMATS = {"npz": ".npz", VIDEO_FORMAT: ".npz", "png16": "_depth.png", "npy": "_depth.npy", "none": ""}
+"""Kinds of results, and how the names of their files end."""
+
 PICTURES_UP_TO = 20
 """Sources of at most this many frames get pictures by default: one picture takes longer than a hundred frames."""
 

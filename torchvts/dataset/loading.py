@@ -17,6 +17,9 @@ from ..model import Sensor
 from .items import Item, list_items
 from .records import Records
 
+HANDED_OVER = 8
+"""Frames that a loader process hands over at once."""
+
 
 class Entry(NamedTuple):
     """What a loader hands over: a frame, without image where it cannot be used or is not needed any more, or the end of a film.
@@ -45,19 +48,16 @@ Batch = tuple[list[tuple[Entry, bool]], Array]
 /dev/shm or a limit of the size of files ends in silence."""
 
 
-def load_frames(
-    records: Records, sensor: Sensor, share: tuple[int, int], batch: int, workers: int
-) -> Iterator[tuple[Entry, Tensor | None]]:
+def load_frames(records: Records, sensor: Sensor, share: tuple[int, int], workers: int) -> Iterator[tuple[Entry, Tensor | None]]:
     """The images of one rank's share and the first frames of videos, each with its image (1, 3, H, W), rectified, if it has one.
 
     Args:
         records: of the run: which source it reads and which frames are done.
         sensor: rectifies the frames.
         share: rank of this process, number of processes.
-        batch: frames that a loader process hands over at once.
         workers: number of loader processes; 0 reads in this process.
     """
-    loader = DataLoader(_Frames(records, sensor, share, batch), batch_size=None, num_workers=workers, collate_fn=_as_is)
+    loader = DataLoader(_Frames(records, sensor, share), batch_size=None, num_workers=workers, collate_fn=_as_is)
     for frames, images in loader:
         left = (image[None] for image in torch.from_numpy(images))
         for frame, has_image in frames:
@@ -78,8 +78,8 @@ class _Frames(IterableDataset[Batch]):
     Decoding in order is exact for any codec; seeking is not.
     """
 
-    def __init__(self, records: Records, sensor: Sensor, share: tuple[int, int], batch: int) -> None:
-        self.records, self.sensor, self.share, self.batch = records, sensor, share, batch
+    def __init__(self, records: Records, sensor: Sensor, share: tuple[int, int]) -> None:
+        self.records, self.sensor, self.share = records, sensor, share
 
     def __iter__(self) -> Iterator[Batch]:
         frames: list[tuple[Entry, bool]] = []
@@ -88,7 +88,7 @@ class _Frames(IterableDataset[Batch]):
             image, failed = self._load(read) if read is not None else ([], frame.failed)
             frames.append((frame._replace(failed=failed), bool(image)))
             images += image
-            if len(frames) == self.batch:
+            if len(frames) == HANDED_OVER:
                 yield frames, _stacked(images)
                 frames, images = [], []
         yield frames, _stacked(images)

@@ -1,4 +1,4 @@
-"""What a run keeps beside its results: the settings that it began with, one record per finished frame, and the tables made of them.
+"""One record per finished frame beside the results of a run, and the tables made of them.
 
 A record is written after the files of its frame are in place, each of them whole. So a frame is done when its record can be read,
 was made of the same source file, and its files are there. Nothing else has to be kept or merged, and a kill loses only the
@@ -9,91 +9,19 @@ import csv
 import json
 import math
 import os
-import re
-import shutil
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ..core.files import make_folder, naming, write_atomically
+from ..core.files import naming, write_atomically
 from ..core.results import join_results
-from ..stream import FIRST_FRAMES
-from .items import STATE, Item, Source, has_few_frames, list_items, one_line
-
-VIDEO_FORMAT = "video-npz"
-FORMATS = {"npz": ".npz", VIDEO_FORMAT: ".npz", "png16": "_depth.png", "npy": "_depth.npy", "none": ""}
-"""Kinds of results, and how the names of their files end."""
-
-SUFFIXES = (*filter(None, dict.fromkeys(FORMATS.values())), ".ply", ".obj", ".pcd", "_picture.png")
-"""How the names of all files of a frame end."""
-
-PARTS = "parts"
-"""Folder beside the records where the frames of a video wait until it is done."""
+from .items import FORMATS, PARTS, STATE, VIDEO_FORMAT, Item, Source, list_items, one_line
+from .settings import Settings
 
 Record = dict[str, Any]
 """``mark`` of the source file; then ``deepest_mm``, ``contact_mm2`` and ``doubt`` of a frame, ``frames`` of a whole video, or
 ``failed``, the reason why there is no result."""
-
-
-@dataclass(frozen=True)
-class Settings:
-    """What the results of a run depend on; a run is only continued with the same. ``pictures`` may be None when it begins."""
-
-    calibration_sha256: str
-    network_sha256: str
-    source: str
-    mode: str
-    format: str
-    cloud: str
-    pictures: bool | None
-    every: int
-    device: str
-    threads: int
-    torchvts: str
-    torch: str
-    background_frames: int = FIRST_FRAMES
-    contact: dict[str, float] | None = None
-    length_unit: str = "mm"
-
-
-def begin(source: Source, out: Path, settings: Settings, overwrite: bool) -> Settings:
-    """Begin or continue a run in ``out``: write the settings, or compare them with those that are there; remove incomplete files.
-
-    With ``overwrite`` the files of the frames that an earlier run wrote go too, whatever its settings were.
-
-    Raises:
-        ValueError: the run was begun with other settings.
-    """
-    if overwrite:
-        _remove_results(out)
-        shutil.rmtree(out / STATE / "frames", ignore_errors=True)
-        shutil.rmtree(out / STATE / PARTS, ignore_errors=True)
-        for path in (out / STATE / "settings.json", out / "frames.csv", out / "failed.csv", out / "summary.json"):
-            path.unlink(missing_ok=True)
-    if (out / STATE / "settings.json").exists():
-        settings = join(out, settings)
-    else:
-        if settings.pictures is None:
-            settings = replace(settings, pictures=has_few_frames(source, settings.every))
-        with write_atomically(out / STATE / "settings.json") as temporary:
-            temporary.write_text(json.dumps(asdict(settings), indent=1), encoding="utf-8")
-    incomplete = re.compile(r"\..+-[0-9a-f]{8}\.(png|npy|npz|pcd|ply|obj|csv|json)")  # names of write_atomically
-    for folder, folders, names in os.walk(out):
-        folders[:] = [name for name in folders if name != STATE]
-        for name in filter(incomplete.fullmatch, names):
-            Path(folder, name).unlink(missing_ok=True)
-    return settings
-
-
-def _remove_results(out: Path) -> None:
-    """Remove the files of every frame that an earlier run recorded, whatever its formats were."""
-    frames = out / STATE / "frames"
-    for record in frames.rglob("*.json"):
-        stem = out / record.relative_to(frames).with_suffix("")
-        for suffix in SUFFIXES:
-            stem.with_name(stem.name + suffix).unlink(missing_ok=True)
 
 
 def _is_record(record: object) -> bool:
@@ -107,54 +35,6 @@ def _is_record(record: object) -> bool:
     figures = [record.get(name) for name in ("deepest_mm", "contact_mm2")]
     sound = all(isinstance(value, float | int) and not isinstance(value, bool) and math.isfinite(value) for value in figures)
     return sound and isinstance(record.get("doubt"), str) and isinstance(record.get("bytes"), list)
-
-
-def join(out: Path, settings: Settings) -> Settings:
-    """The settings with which a run was begun.
-
-    Raises:
-        ValueError: they differ from ``settings``, or cannot be read.
-    """
-    path = out / STATE / "settings.json"
-    try:
-        begun = Settings(**json.loads(path.read_text(encoding="utf-8")))
-    except (ValueError, TypeError) as error:
-        raise ValueError(f"{path}: not the settings of a run ({error}): give another --out, or --overwrite") from error
-    if settings.pictures is None:
-        settings = replace(settings, pictures=begun.pictures)
-    names = {"calibration_sha256": "calibration file"}
-    other = [
-        f"{names.get(field.name, field.name)} {str(getattr(begun, field.name))[:60]!r} then, "
-        f"{str(getattr(settings, field.name))[:60]!r} now"
-        for field in fields(Settings)
-        if getattr(begun, field.name) != getattr(settings, field.name)
-    ]
-    if other:
-        raise ValueError(
-            f"out: {out} was begun with other settings: {'; '.join(other)}: give another --out, or --overwrite to begin anew"
-        )
-    return begun
-
-
-@contextmanager
-def locked(out: Path) -> Iterator[None]:
-    """Hold ``out`` for one run; the system releases it when the process ends, however that happens.
-
-    Raises:
-        RuntimeError: another run holds it.
-    """
-    make_folder(out / STATE)
-    try:
-        import fcntl
-    except ImportError:  # no such locks on this system
-        yield
-        return
-    with (out / STATE / "lock").open("w") as stream:
-        try:
-            fcntl.lockf(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            raise RuntimeError(f"out: another run is writing into {out}: wait for it, or stop it") from error
-        yield
 
 
 @dataclass(frozen=True)

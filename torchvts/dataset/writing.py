@@ -17,8 +17,9 @@ from ..pipeline import DepthOutput
 from ..pose import OutputFrame, write_point_cloud
 from ..pose.surface_files import write_obj
 from ..skin import SkinMotion
+from .items import VIDEO_FORMAT
 from .loading import Entry
-from .records import VIDEO_FORMAT, Records
+from .records import Records
 
 
 class Writer:

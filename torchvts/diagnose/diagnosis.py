@@ -42,7 +42,7 @@ def diagnose(background: Tensor | None, image: Tensor, calibration: Calibration)
                 f"{name} is {frame.shape[1]} x {frame.shape[2]} pixels, the calibration is for {sensor.height} x {sensor.width}: "
                 "another camera mode or sensor; rectify or resize it as at calibration"
             )
-            return Diagnosis.of([Finding("wrong_size", message, "fault", frame.shape[2] / sensor.width)])
+            return Diagnosis.of([Finding("wrong_size", message, "fault", 1.0)])
     return Diagnosis.of(run_checks(Examination(calibration, image, given)))
 
 

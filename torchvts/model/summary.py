@@ -102,10 +102,12 @@ def left_out(what: str, rows: list[tuple[str, str]]) -> Iterator[str]:
 
 
 def _tried(report: Report) -> list[str]:
-    """A row for each model that was made."""
-    rows = [[row["name"], number(row["error_deg"], 2), "; ".join(row["doubts"])] for row in report.get("tried", [])]
+    """A row for each model that was made, with what is not said above."""
+    said = report.get("doubts", [])
+    tried = [(row, "; ".join(doubt for doubt in row["doubts"] if doubt not in said)) for row in report.get("tried", [])]
+    rows = [[row["name"], number(row["error_deg"], 2), beside] for row, beside in tried]
     meaning = "deg: mean angle on each press by the others, or of a prior on other units; of lights the least certain direction"
-    return [markdown(("model", "deg", "doubts"), rows), meaning]
+    return [markdown(("model tried", "deg", "doubts beside those above"), rows), meaning]
 
 
 def _lights(lights: PointLights, report: Report) -> str:

@@ -96,7 +96,7 @@ class DepthPipeline(nn.Module):
         self.solve = Solve(model, gradient, integrator, ZeroBackground(mm_per_pixel))
         own = isinstance(mask, ContactMask) and type(mask).forward is ContactMask.forward
         self.takes_slopes = own and model.calibrated
-        self.refine = Refine(self.solve, model.passes if mode == "precise" and model.uses_depth else 1)
+        self.refine: nn.Module = Refine(self.solve, model.passes if mode == "precise" and model.uses_depth else 1)
         self.slopes = SlopesOfDepth(mm_per_pixel) if model.normals_from_depth else SlopesOfPixels()
         self.contact = touching
 
@@ -163,14 +163,13 @@ class DepthPipeline(nn.Module):
             return eval_around(pipe, *given)
 
     @classmethod
-    def from_gs_sdk(cls, weights: str | Path, background: Tensor, sensor: Sensor | str, mode: str = "fast") -> "DepthPipeline":
-        """The pipeline of a network that gs_sdk trained, on the images that it was trained on.
+    def from_gs_sdk(cls, weights: str | Path, background: Tensor, sensor: Sensor | str) -> "DepthPipeline":
+        """The pipeline of a network that gs_sdk trained, on the images that it was trained on; mode fast, for it takes no depth.
 
         Args:
             weights: gs_sdk's ``nnmodel.pth``, of which nothing but tensors is unpickled; or what ``torchvts train`` wrote.
             background: (3, H, W), image of the unit without contact in [0, 1], R, G, B; the network's gradients there are zero.
             sensor: the sensor, or what :meth:`Sensor.load` takes.
-            mode: "fast": a network takes no depth.
         Raises:
             FileNotFoundError: no such weights or sensor.
             ValueError, TypeError: no weights of such a network, or a background of another size, type or range.
@@ -178,7 +177,7 @@ class DepthPipeline(nn.Module):
             >>> pipe = DepthPipeline.from_gs_sdk("nnmodel.pth", background, "gelsight_mini")  # doctest: +SKIP
         """
         sensor = sensor if isinstance(sensor, Sensor) else Sensor.load(sensor)
-        return cls(*gs_sdk_blocks(weights, background, sensor), mm_per_pixel=sensor.mm_per_pixel, mode=mode).eval()
+        return cls(*gs_sdk_blocks(weights, background, sensor), mm_per_pixel=sensor.mm_per_pixel).eval()
 
     if TYPE_CHECKING:
 

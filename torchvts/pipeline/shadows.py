@@ -53,9 +53,10 @@ class Shadows(nn.Module):
         torch.Size([1, 1, 48, 64])
     """
 
-    def __init__(self, refine: Refine, mm_per_pixel: float, rounds: int = 3) -> None:
+    def __init__(self, refine: nn.Module, mm_per_pixel: float, rounds: int = 3) -> None:
         super().__init__()
         check_record("refine", refine, Refine, 'pipe.refine of DepthPipeline.from_calibration(calibration, "precise") is one')
+        assert isinstance(refine, Refine)
         if not isinstance(refine.solve.normals, NormalFromIntensity):
             raise ValueError(
                 f"refine: expected normals by lights, NormalFromIntensity, got {type(refine.solve.normals).__name__}: "

@@ -1,6 +1,7 @@
 """How far each printed dot of a skin has moved, in millimetres, with its covariance."""
 
 import math
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import torch
@@ -343,6 +344,7 @@ class SkinMotion(nn.Module):
         return seen / self.mm_per_pixel + 0.5 * size
 
 
+@lru_cache(maxsize=1)  # finding the dots takes longer than following them
 def motion_of_unit(calibration: Calibration) -> SkinMotion | None:
     """The module of a calibrated unit; None where its skin has no dots that could be followed."""
     try:

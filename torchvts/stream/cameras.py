@@ -1,12 +1,13 @@
-"""A camera with the size, rate, exposure and white balance that its driver takes."""
+"""A camera, with the size, rate, exposure and white balance that its driver takes."""
 
 import sys
 import warnings
 from typing import NamedTuple
 
 from ..core.checks import check_integer, check_positive
-from ..core.recordings import lossy_codec
-from .sources import CameraReader
+from ..core.files import check_text_name
+from ..core.recordings import Pixels, frames_a_second, lossy_codec
+from .devices import found_cameras
 
 
 class CameraSettings(NamedTuple):
@@ -30,43 +31,71 @@ class CameraSettings(NamedTuple):
         return any(value is not None for value in self)
 
 
-class Camera(CameraReader):
-    """A camera with settings; what the driver does not take is warned of.
+AS_IT_IS = CameraSettings()
+"""Nothing is asked."""
+
+
+class Camera:
+    """A camera (an index) or a network camera (a URL), by OpenCV; what the driver does not take of the settings is warned of.
 
     Where it does not take size or rate, as an uncompressed format may not allow them, they are asked for in MJPG.
 
     Args:
-        index: the camera's index.
+        source: the camera's index, or a URL.
         settings: what is asked of the driver.
     Raises:
         OSError: no such camera.
         ValueError: settings that make no sense.
     """
 
-    def __init__(self, index: int, settings: CameraSettings) -> None:
+    live = True
+
+    def __init__(self, source: int | str, settings: CameraSettings = AS_IT_IS) -> None:
         import cv2
 
-        super().__init__(index)
+        self.name = f"camera {source}" if isinstance(source, int) else source
+        self._capture = cv2.VideoCapture(source if isinstance(source, int) else check_text_name("source", source))
         try:
-            form, fixed = _asked(settings)
-            if not self._take(form):
-                self._capture.set(cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*"MJPG"))
-                self._take(form)
-            if settings.exposure is not None:
-                self._capture.set(cv2.CAP_PROP_AUTO_EXPOSURE, 1.0 if sys.platform.startswith("linux") else 0.25)
-            if settings.white_balance is not None:
-                self._capture.set(cv2.CAP_PROP_AUTO_WB, 0.0)
-            self._take(fixed)
-            for name, (key, value) in (form | fixed).items():  # read back when all are set: the size limits the rate
-                if not self._takes(key, value):
-                    taken = float(self._capture.get(key))
-                    warnings.warn(f"camera {index}: asked for {name} {value:g}, the driver took {taken:g}", stacklevel=2)
-            self.codec = lossy_codec(self._capture)
-            if settings.fps is not None:
-                self.fps = float(self._capture.get(cv2.CAP_PROP_FPS)) or self.fps
+            if not self._capture.isOpened() and isinstance(source, int):
+                raise OSError(
+                    f"source: expected a camera with index {source}, got none that opens: plugged in? in use elsewhere? "
+                    f"{found_cameras()}"
+                )
+            if not self._capture.isOpened():
+                raise OSError(
+                    f"source: expected a network camera at {source}, got none that opens: is it on? is the address right?"
+                )
+            self._capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
+            self._ask(settings)
         except BaseException:
             self.close()
             raise
+        self.fps, self.codec = frames_a_second(self._capture), lossy_codec(self._capture)
+
+    def read(self) -> Pixels | None:
+        there, pixels = self._capture.read()
+        return pixels if there else None
+
+    def close(self) -> None:
+        self._capture.release()
+
+    def _ask(self, settings: CameraSettings) -> None:
+        """Ask the driver for the settings, and warn of those that it does not take."""
+        import cv2
+
+        form, fixed = _asked(settings)
+        if not self._take(form):
+            self._capture.set(cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*"MJPG"))
+            self._take(form)
+        if settings.exposure is not None:
+            self._capture.set(cv2.CAP_PROP_AUTO_EXPOSURE, 1.0 if sys.platform.startswith("linux") else 0.25)
+        if settings.white_balance is not None:
+            self._capture.set(cv2.CAP_PROP_AUTO_WB, 0.0)
+        self._take(fixed)
+        for name, (key, value) in (form | fixed).items():  # read back when all are set: the size limits the rate
+            if not self._takes(key, value):
+                taken = float(self._capture.get(key))
+                warnings.warn(f"{self.name}: asked for {name} {value:g}, the driver took {taken:g}", stacklevel=2)
 
     def _take(self, asked: dict[str, tuple[int, float]]) -> bool:
         """Ask the driver, and say whether it took all."""

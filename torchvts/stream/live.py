@@ -21,6 +21,7 @@ from .background import (
     find_background,
     with_background,
 )
+from .cameras import AS_IT_IS, CameraSettings
 from .numbered import SourceFrames
 from .record import Recorder
 from .recording import NotAtRest, Recording
@@ -72,12 +73,12 @@ class TactileStream:
         reconnect_s: for how long a camera that has stopped is opened again before an error is raised; not with a :class:`Reader`.
         contact: thresholds of contact; None for the usual ones.
         record: where the raw frames of a camera are written, see :class:`Recorder`; None for nowhere.
+        settings: size, rate, exposure and white balance of a camera; not with a :class:`Reader`.
     Attributes:
         calibration: of the unit.
-        dropped: number of frames that nobody took.
         left_out: (number, reason) of the frames that could not be used.
+        recording: :class:`Recording`, that of the calibration and its background.
         stages: :class:`StageClock`.
-        fps: rate of the source.
     Raises:
         ValueError: contact or changing light in the first frames, or a source that cannot be read.
         OSError: no such source; also while frames are read: a camera was unplugged, or has stopped.
@@ -101,39 +102,33 @@ class TactileStream:
         reconnect_s: float = 0.0,
         contact: ContactSettings | None = None,
         record: str | Path | None = None,
+        settings: CameraSettings = AS_IT_IS,
     ) -> None:
         check_choice("mode", mode, MODES)
         if contact is not None:
             check_record("contact", contact, ContactSettings, "ContactSettings(sigmas=...) makes one")
+        check_record("settings", settings, CameraSettings)
         check_switch("realtime", realtime)
-        sensor = _sensor_of(sensor_or_calibration, background_frames, presses)
-        self.reader = _reader_of(source, reconnect_s, record)
-        self.fps = self.reader.fps
+        self._sensor = _sensor_of(sensor_or_calibration, background_frames, presses)
         self.stages = StageClock()
         self.left_out: list[tuple[int, str]] = []
         self._zero: list[Tensor] = []
         self._doubted = False
         self._zero_missing = 0
+        self._frames = SourceFrames(_reader_of(source, reconnect_s, record, settings), background_frames, realtime, self.stages)
+        self._size = self._frames.readable[0].shape[:2]
+        self._codec: str = getattr(self.reader, "codec", "")
+        self._begin = partial(
+            Recording, mode=mode, network=network, device=device, contact=contact, codec=self._codec, stage=self.stages.stage
+        )
         try:
-            self._frames = SourceFrames(self.reader, background_frames, realtime, self.stages)
-            self._sensor, self._size = sensor, self._frames.readable[0].shape[:2]
             first = torch.cat([self._rectified(pixels) for pixels in self._frames.readable])
-            self._codec: str = getattr(self.reader, "codec", "")
             self.calibration = _calibrated(first, sensor_or_calibration, presses, self._codec)
-            self._start = partial(
-                Recording,
-                mode=mode,
-                network=network,
-                device=device,
-                contact=contact,
-                codec=self._codec,
-                stage=self.stages.stage,
-            )
-            self._use(self._start(self.calibration, first=first if background_frames > 0 else None))
+            self.recording = self._begin(self.calibration, first=first if background_frames > 0 else None)
         except BaseException as error:
-            self.reader.close()
-            if isinstance(error, NotAtRest) and sensor is sensor_or_calibration:  # what these frames made fits none of them
-                raise ValueError(UNKNOWN_LIGHT.format(sensor.name, int(background_frames))) from error
+            self.close()
+            if isinstance(error, NotAtRest) and isinstance(sensor_or_calibration, Sensor):  # what these frames made fits none
+                raise ValueError(UNKNOWN_LIGHT.format(self._sensor.name, int(background_frames))) from error
             raise
 
     def _rectified(self, pixels: Pixels) -> Tensor:
@@ -153,10 +148,6 @@ class TactileStream:
         """
         self._zero, self._zero_missing = [], check_integer("frames", frames, 3)
 
-    def _use(self, recording: Recording) -> None:
-        """Go on with a recording: the first one, or that of a new background."""
-        self.recording, self.pipe = recording, recording.pipe
-
     def _collect(self, raw: Tensor) -> None:
         """Keep a frame for the new background, and change to it when there are enough."""
         self._zero.append(raw)
@@ -168,11 +159,19 @@ class TactileStream:
         try:
             background = find_background(first, self.calibration.sensor, self._codec).clamp(0.0, 1.0)
             calibration = with_background(self.calibration, background)
-            self._use(self._start(calibration, first=first))
+            self.recording, self.calibration = self._begin(calibration, first=first), calibration
         except ValueError as error:
             warnings.warn(f"re-zero refused, the background stays: {error}", stacklevel=3)
-        else:
-            self.calibration = calibration
+
+    @property
+    def reader(self) -> Reader:
+        """What reads the source."""
+        return self._frames.reader
+
+    @property
+    def fps(self) -> float:
+        """Rate of the source, frames a second."""
+        return self.reader.fps
 
     @property
     def metric(self) -> bool:
@@ -261,12 +260,16 @@ def _calibrated(first: Tensor, unit: Sensor | Calibration, presses: Sequence[Pre
         return calibrate(background, unit, presses)
 
 
-def _reader_of(source: str | int | Path | Reader, reconnect_s: float, record: str | Path | None) -> Reader:
+def _reader_of(
+    source: str | int | Path | Reader, reconnect_s: float, record: str | Path | None, settings: CameraSettings
+) -> Reader:
     """Open a source, or take a reader of the user's own; record what it gives."""
     if isinstance(source, str | int | Path):
-        reader = open_source(source, reconnect_s)
+        reader = open_source(source, reconnect_s, settings)
     elif check_least("reconnect_s", reconnect_s) > 0:
         raise ValueError(f"reconnect_s: expected 0 with a reader of your own, got {reconnect_s:g}: it must reconnect by itself")
+    elif settings.given:
+        raise ValueError(f"settings: expected none with a reader of your own, got {settings}: it must ask the driver by itself")
     else:
         reader = check_reader(source)
     if record is None:

@@ -9,8 +9,7 @@ from typing import Any
 from ..core.checks import check_positive
 from ..core.files import check_pixels
 from ..core.recordings import Pixels
-from .record import Recorder
-from .sources import MOST_FPS, SETTLING, LiveReader, Reader, Unreadable, time_of
+from .sources import MOST_FPS, SETTLING, Reader, Unreadable, time_of
 from .stages import StageClock
 
 NumberedFrame = tuple[int, float, Pixels | Unreadable]
@@ -25,6 +24,7 @@ class NewestFrame:
         rate: frames a second at which a recording is played; None for a camera, which has its own.
         clock: for tests.
         sleep: for tests.
+        first: frames that were read before, which come first.
     Attributes:
         started_s: time 0 of its frames by ``clock``.
     """
@@ -35,12 +35,13 @@ class NewestFrame:
         rate: float | None = None,
         clock: Callable[[], float] = time.monotonic,
         sleep: Callable[[float], Any] | None = None,
+        first: deque[Pixels | Unreadable] | None = None,
     ) -> None:
         if rate is not None:
             check_positive("rate", rate, MOST_FPS)
         self.dropped = 0
         self.started_s = clock()
-        self._reader, self._rate, self._clock = reader, rate, clock
+        self._reader, self._rate, self._first, self._clock = reader, rate, first, clock
         self._changed, self._stop = threading.Condition(), threading.Event()
         self._sleep = sleep or self._stop.wait
         self._newest: NumberedFrame | None = None
@@ -53,7 +54,7 @@ class NewestFrame:
         try:
             start, index = self.started_s, 0
             while not self._stop.is_set():
-                pixels = self._reader.read()
+                pixels = self._first.popleft() if self._first else self._reader.read()
                 if pixels is None:
                     break
                 if self._rate is not None:
@@ -89,7 +90,7 @@ class NewestFrame:
     def close(self) -> None:
         """End the thread, then release the source."""
         self._stop.set()
-        if isinstance(self._reader, LiveReader | Recorder):
+        if self._reader.live:
             self._reader.close()  # ends a read that waits
         self._thread.join(timeout=5.0)
         self._reader.close()
@@ -97,6 +98,8 @@ class NewestFrame:
 
 class SourceFrames:
     """Frames of a source in order: first some that can be read, kept in ``first``, then all that it has by iteration.
+
+    The source is closed where it has too few.
 
     A recording gives the first ones again. Of a live source, or a recording that is played at its own rate, only the newest
     frame is given.
@@ -114,19 +117,27 @@ class SourceFrames:
     """
 
     def __init__(self, reader: Reader, least: int, realtime: bool, stages: StageClock) -> None:
-        self._reader, self._realtime, self._stages = reader, realtime or reader.live, stages
+        self.reader, self._realtime, self._stages = reader, realtime or reader.live, stages
         self._newest: NewestFrame | None = None
         self._given = 0
         self.started_s = time.monotonic()
         self.first: deque[Pixels | Unreadable] = deque()
+        try:
+            self._read_first(max(1, least))
+        except BaseException:
+            reader.close()
+            raise
+
+    def _read_first(self, least: int) -> None:
+        reader = self.reader
         if reader.live:  # exposure settles
             for _ in range(SETTLING):
                 reader.read()
-        while len(self.readable) < max(1, least) and (pixels := reader.read()) is not None:
+        while len(self.readable) < least and (pixels := reader.read()) is not None:
             if not isinstance(pixels, Unreadable):
                 check_pixels(f"source: frame {len(self.first)} of {reader.name}", pixels)
             self.first.append(pixels)
-        if len(self.readable) < max(1, least):
+        if len(self.readable) < least:
             raise ValueError(
                 f"background_frames: expected at least {least} frames from {reader.name}, got {len(self.readable)}: ask for fewer"
             )
@@ -151,19 +162,18 @@ class SourceFrames:
                 pixels: Pixels | Unreadable | None = self.first.popleft()
             else:
                 with self._stages.stage("read"):
-                    pixels = self._reader.read()
+                    pixels = self.reader.read()
             if pixels is None:
                 return
             index, self._given = self._given, self._given + 1
-            yield index, time_of(index, self._reader.fps, getattr(self._reader, "times", ())), pixels
+            yield index, time_of(index, self.reader.fps, getattr(self.reader, "times", ())), pixels
 
     def _newest_ones(self) -> Iterator[NumberedFrame]:
         """The frames that are the newest when they are asked for; of a recording the first ones are played again."""
-        if self._newest is None and self._reader.live:
+        if self._newest is None and self.reader.live:
             self.first.clear()  # they are gone
-            self._newest = NewestFrame(self._reader)
-        elif self._newest is None:
-            self._newest = NewestFrame(_Replay(self._reader, self.first), self._reader.fps)
+        if self._newest is None:
+            self._newest = NewestFrame(self.reader, None if self.reader.live else self.reader.fps, first=self.first)
         self.started_s = self._newest.started_s
         while True:
             with self._stages.stage("wait"):
@@ -174,18 +184,4 @@ class SourceFrames:
 
     def close(self) -> None:
         """Stop reading and release the source."""
-        (self._newest or self._reader).close()
-
-
-class _Replay:
-    """A reader that gives frames that were already read, then those of another reader."""
-
-    def __init__(self, reader: Reader, first: deque[Pixels | Unreadable]) -> None:
-        self.name, self.live, self.fps = reader.name, reader.live, reader.fps
-        self._reader, self._first = reader, first
-
-    def read(self) -> Pixels | Unreadable | None:
-        return self._first.popleft() if self._first else self._reader.read()
-
-    def close(self) -> None:
-        self._reader.close()
+        (self._newest or self.reader).close()

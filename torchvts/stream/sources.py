@@ -12,19 +12,18 @@ from typing import Any, NamedTuple, Protocol
 
 from torch import Tensor
 
-from ..core.checks import brief, check_integer, check_least, check_path, check_positive, parse_number
-from ..core.files import IMAGE_SUFFIXES, VIDEO_SUFFIXES, check_text_name, rgb_from_bgr
+from ..core.checks import brief, check_integer, check_least, check_path, check_positive, check_record, parse_number
+from ..core.files import IMAGE_SUFFIXES, VIDEO_SUFFIXES, rgb_from_bgr
 from ..core.recordings import (
     Pixels,
     RawFrame,
     cut_short,
-    frames_a_second,
     image_files,
-    lossy_codec,
     raw_frames,
     video_codec,
     video_rate,
 )
+from .cameras import AS_IT_IS, Camera, CameraSettings
 from .devices import find_camera, found_cameras
 
 MOST_CAMERAS = 99
@@ -77,35 +76,6 @@ class Reader(Protocol):
 
     def close(self) -> None:
         """Release the device or file."""
-
-
-class CameraReader:
-    """A camera (an index) or a network camera (a URL), by OpenCV."""
-
-    live = True
-
-    def __init__(self, source: int | str) -> None:
-        import cv2
-
-        self.name = f"camera {source}" if isinstance(source, int) else source
-        self._capture = cv2.VideoCapture(source if isinstance(source, int) else check_text_name("source", source))
-        if not self._capture.isOpened():
-            self._capture.release()
-            if isinstance(source, int):
-                raise OSError(
-                    f"source: expected a camera with index {source}, got none that opens: plugged in? in use elsewhere? "
-                    f"{found_cameras()}"
-                )
-            raise OSError(f"source: expected a network camera at {source}, got none that opens: is it on? is the address right?")
-        self._capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
-        self.fps, self.codec = frames_a_second(self._capture), lossy_codec(self._capture)
-
-    def read(self) -> Pixels | None:
-        there, pixels = self._capture.read()
-        return pixels if there else None
-
-    def close(self) -> None:
-        self._capture.release()
 
 
 class LiveReader:
@@ -338,33 +308,37 @@ def _of_camera(reader: Reader) -> Iterator[tuple[str, Tensor]]:
         reader.close()
 
 
-def open_source(source: str | int | Path, reconnect_s: float = 0.0) -> Reader:
+def open_source(source: str | int | Path, reconnect_s: float = 0.0, settings: CameraSettings = AS_IT_IS) -> Reader:
     """Open a camera (:func:`find_camera`), a network camera by its URL, a video, an image or TIFF, or a folder of images.
 
     Args:
         source: what to open.
         reconnect_s: for how long a camera that has stopped is tried again before :class:`OSError` is raised.
+        settings: what is asked of a camera's driver.
     Raises:
         FileNotFoundError: no such file or folder.
         OSError: no such camera.
-        ValueError: not a video, or no images.
+        ValueError: not a video, no images, or settings of what is no camera.
     """
     check_least("reconnect_s", reconnect_s)
+    check_record("settings", settings, CameraSettings)
     if isinstance(source, int) and not isinstance(source, bool):
         index = check_integer("source", source, 0, MOST_CAMERAS)
-        return LiveReader(lambda: CameraReader(index), reconnect_s)
+        return LiveReader(lambda: Camera(index, settings), reconnect_s)
     text = str(check_path("source", source))
     if text.isascii() and text.isdigit():
         if len(text) > 9 or int(text) > MOST_CAMERAS:
             raise ValueError(f"source: expected a camera's index of at most {MOST_CAMERAS}, got {brief(text)}")
-        return LiveReader(lambda: CameraReader(int(text)), reconnect_s)
-    if isinstance(source, str) and source.lower().startswith(URLS):
-        return LiveReader(lambda: CameraReader(source), reconnect_s)
+        return LiveReader(lambda: Camera(int(text), settings), reconnect_s)
     path = Path(text)
+    if not path.is_dir() and find_camera(text) is not None:
+        return LiveReader(lambda: Camera(_index_of(text), settings), reconnect_s)  # found again: it may come back as another
+    if settings.given:
+        raise ValueError(f"settings: size, rate, exposure and white balance are those of a camera of this machine, got {text}")
+    if isinstance(source, str) and source.lower().startswith(URLS):
+        return LiveReader(lambda: Camera(source), reconnect_s)
     if path.is_dir():
         return FileReader(path)
-    if find_camera(text) is not None:
-        return LiveReader(lambda: CameraReader(_index_of(text)), reconnect_s)  # found again: it may come back as another
     if not path.is_file():
         raise FileNotFoundError(
             "source: expected a file, a folder, a URL, or a camera by index, /dev path, name or serial number, "

@@ -1,10 +1,8 @@
 """Writes videos whole or not at all, in a thread of their own."""
 
-import os
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +10,8 @@ from ..core.checks import check_path, check_positive
 from ..core.files import check_text_name, write_atomically
 from ..core.recordings import Pixels, open_video
 
-CODES = {".webm": ("VP80",), ".mp4": ("avc1", "mp4v"), ".avi": ("MJPG",), ".mkv": ("FFV1",)}
-"""Suffixes of the videos that can be written, and OpenCV's codes for each: the first that it has here is taken."""
+CODES = {".webm": "VP80", ".mp4": "mp4v", ".avi": "MJPG", ".mkv": "FFV1"}
+"""Suffixes of the videos that can be written, and OpenCV's code for each."""
 
 MOST_WAITING = 8
 """So many pictures wait to be written before who brings more waits."""
@@ -44,8 +42,8 @@ class VideoFile:
     OpenCV reports no error of a write, as on a full disk. A thread encodes while the next frame is worked on.
 
     Args:
-        path: .webm (VP8, which browsers play), .mp4 (H.264 where this OpenCV has it, as browsers need; else mp4v), .avi (MJPG)
-            or .mkv (FFV1, which loses nothing of an even size).
+        path: .webm (VP8, which browsers play), .mp4 (MPEG-4 part 2), .avi (MJPG) or .mkv (FFV1, which loses nothing
+            of an even size).
         fps: frames a second.
         keep: keep what can be read where not all could be written, and raise all the same.
     Raises:
@@ -85,11 +83,10 @@ class VideoFile:
     def _open(self) -> Any:
         import cv2
 
-        for code in CODES[self.path.suffix.lower()]:
-            with _silent():
-                writer = cv2.VideoWriter(str(self._temporary), cv2.VideoWriter.fourcc(*code), self.fps, self._size[::-1])
-            if writer.isOpened():
-                return writer
+        code = CODES[self.path.suffix.lower()]
+        writer = cv2.VideoWriter(str(self._temporary), cv2.VideoWriter.fourcc(*code), self.fps, self._size[::-1])
+        if writer.isOpened():
+            return writer
         raise OSError(f"video: {self.path}: OpenCV cannot write this kind of file here: try .avi")
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: Any) -> None:
@@ -110,24 +107,6 @@ class VideoFile:
                 f"video: {self.path}: cannot be written: {there} of {self._count} frames can be read back"
                 f"{' and are kept' * (self.keep and there > 0)}: is the disk full?"
             )
-
-
-@contextmanager
-def _silent() -> Iterator[None]:
-    """Drop what OpenCV prints, not by Python, of codecs that it does not have."""
-    try:
-        kept = os.dup(2)
-    except OSError:  # there is no such stream
-        yield
-        return
-    nowhere = os.open(os.devnull, os.O_WRONLY)
-    os.dup2(nowhere, 2)
-    try:
-        yield
-    finally:
-        os.dup2(kept, 2)
-        os.close(kept)
-        os.close(nowhere)
 
 
 def count_packets(path: Path) -> int:

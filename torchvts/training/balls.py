@@ -1,4 +1,4 @@
-"""Balls that are pressed: their true surface inside the contact, and the sphere that fits measured depth."""
+"""Balls that are pressed: their true surface inside the contact."""
 
 from typing import NamedTuple
 
@@ -6,8 +6,7 @@ import torch
 from torch import Tensor
 
 from ..calibration import Press
-from ..core.checks import check_integer, check_tensor
-from ..core.geometry import depth_to_points, pixel_grid_mm
+from ..core.geometry import pixel_grid_mm
 
 RIM_PX = 3.0
 """Width of the ring inside the contact radius that is not scored: there the skin leaves the ball, and labels are a pixel off."""
@@ -29,20 +28,6 @@ class Truth(NamedTuple):
     region: Tensor
     contact: Tensor | None = None
     from_undeformed: bool = False
-
-
-class SphereFit(NamedTuple):
-    """Least-squares sphere in the point frame (x right, y up, z towards the camera).
-
-    Attributes:
-        center_mm: its centre (x, y, z), mm.
-        radius_mm: its radius, mm.
-        rms_mm: RMS distance of the points from it, mm.
-    """
-
-    center_mm: tuple[float, float, float]
-    radius_mm: float
-    rms_mm: float
 
 
 def ball_truth(press: Press, height: int, width: int, mm_per_pixel: float) -> Truth:
@@ -84,41 +69,3 @@ def label(press: Press) -> tuple[tuple[float, float], float]:
     if press.center_px is None or press.contact_radius_px is None:
         raise ValueError(f"press: expected one with center_px and contact_radius_px, '{press.name}' has none: it cannot be scored")
     return press.center_px, press.contact_radius_px
-
-
-def fit_sphere(depth_mm: Tensor, mm_per_pixel: float, contact: Tensor, steps: int = 20) -> SphereFit:
-    """Geometric least-squares sphere through the points of the contact: algebraic start, then Gauss-Newton on the distance.
-
-    Args:
-        depth_mm: depth of one frame, mm.
-        mm_per_pixel: pixel pitch, mm.
-        contact: bool, the same shape, the pixels to fit.
-        steps: most Gauss-Newton steps; fewer are made where the sphere does not move any more.
-    Raises:
-        ValueError: fewer than 4 points, or depth that is not finite or beyond 1e6 mm.
-    """
-    check_integer("steps", steps, 0)
-    check_tensor("contact", contact)
-    points = depth_to_points(depth_mm, mm_per_pixel, contact).double()
-    if not bool((points.abs() <= 1e6).all()):  # also NaN
-        raise ValueError(
-            "depth_mm: expected finite values of at most 1e6 mm, got others in the contact: an upstream division failed"
-        )
-    if len(points) < 4:
-        raise ValueError(f"contact: expected at least 4 pixels, got {len(points)}: no contact, no sphere")
-    mean = points.mean(0)
-    centred = points - mean
-    columns = torch.cat((2 * centred, torch.ones(len(points), 1, dtype=torch.float64)), 1)
-    solution = torch.linalg.lstsq(columns, centred.square().sum(1, keepdim=True)).solution[:, 0]
-    center, radius = solution[:3], (solution[3] + solution[:3].square().sum()).clamp_min(0).sqrt()
-    for _ in range(steps):
-        offset = centred - center
-        distance = offset.norm(dim=1, keepdim=True)
-        jacobian = torch.cat((-offset / distance, -torch.ones_like(distance)), 1)
-        step = torch.linalg.lstsq(jacobian, distance - radius).solution[:, 0]
-        center, radius = center - step[:3], radius - step[3]
-        if not float(step.abs().max()) > 1e-14 * float(radius.abs()):  # also NaN, where the points lie in a plane
-            break
-    rms = ((centred - center).norm(dim=1) - radius).square().mean().sqrt()
-    x, y, z = (center + mean).tolist()
-    return SphereFit((x, y, z), float(radius), float(rms))

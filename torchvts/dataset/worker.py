@@ -1,0 +1,192 @@
+"""One process's share of a data set: read, reconstruct, write.
+
+Frames of a video go the way of a stream (:class:`torchvts.stream.Recording`): every process reads the first ones, and finds the
+depth of its own. An image is a recording of one frame.
+"""
+
+import os
+import sys
+import time
+from collections import deque
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from ..core.checks import in_one_line
+from ..core.recordings import count_frames, cut_short, video_codec
+from ..model import Calibration
+from ..pipeline import DepthOutput
+from ..skin import ContactSettings, motion_of_unit
+from ..stream import Recording
+from .items import Item, list_items
+from .loading import HANDED_OVER, Entry, load_frames
+from .processes import sum_over_processes
+from .records import Records
+from .writing import Writer
+
+
+class RunReport(NamedTuple):
+    """What a run did; known to rank 0 only.
+
+    Attributes:
+        rank: rank of this process.
+        rows: frames in the table.
+        before: how many of them an earlier run had done.
+        failed: (name, reason) of the frames that were left out.
+        seconds: from the first frame until all processes had finished.
+        notes: (name, text) of what else is to be known: videos whose first frames were not used, or that are cut short.
+        doubted: (name, doubt) of the frames in which less may have been seen than is there.
+    """
+
+    rank: int
+    rows: int
+    before: int
+    failed: list[tuple[str, str]]
+    seconds: float
+    notes: Sequence[tuple[str, str]] = ()
+    doubted: Sequence[tuple[str, str]] = ()
+
+
+NAMED = 5
+"""So many frames that cannot be used are named at once, by each process; a folder of another sensor's has thousands."""
+
+_Reconstructed = tuple[Entry, Tensor | None, DepthOutput | None]
+"""A frame, its image, and its depth."""
+
+
+class Worker:
+    """One rank's share of a data set: read, reconstruct, write."""
+
+    def __init__(
+        self, unit: Calibration, name: str, network: str | Path | None, records: Records, share: tuple[int, int], strict: bool
+    ) -> None:
+        self.unit, self.records, self.settings, self.share, self.strict = unit, records, records.settings, share, strict
+        self.sensor, self.writer = unit.sensor, Writer(records, unit, name)
+        self.writer.motion = motion_of_unit(unit) if records.settings.pictures else None
+        thresholds = None if self.settings.contact is None else ContactSettings(**self.settings.contact)
+        self.recording = partial(
+            Recording, unit, self.settings.mode, network=network, device=self.settings.device, contact=thresholds
+        )
+        self.image = self.recording()
+        self.notes: list[tuple[str, str]] = []
+        self.done = self.failed = 0
+
+    def run(self, workers: int | None) -> RunReport:
+        """Do the whole share; rank 0 then writes the tables. Files are written by threads: most of that is waiting for the disk."""
+        rank, world = self.share
+        source = self.records.source
+        items = list_items(source, self.settings.every)
+        total = sum(count_frames(item.file) if item.is_film else 1 for item in items) // world
+        if workers is None:
+            cores = (os.cpu_count() or 1) // int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
+            workers = 0 if total < 4 * HANDED_OVER else max(1, min(4, cores // 2))
+        writers = 1 if self.settings.pictures else 4  # matplotlib draws in one thread only
+        waiting: deque[tuple[Entry, Future[str]]] = deque()
+        start = time.perf_counter()
+        with tqdm(total=total, unit="frame", disable=rank > 0 or None, smoothing=0.05) as bar, ThreadPoolExecutor(writers) as pool:
+            for frame, image, output in self._depths(load_frames(self.records, self.sensor, self.share, workers)):
+                bar.update(frame.length is None)
+                if not frame.done:
+                    waiting.append((frame, pool.submit(self._write, frame, image, output)))
+                while len(waiting) > 4 * writers:
+                    self._settle(*waiting.popleft())
+            while waiting:
+                self._settle(*waiting.popleft())
+        done = sum_over_processes(self.done)
+        seconds = time.perf_counter() - start
+        if rank > 0:
+            return RunReport(rank, 0, 0, [], seconds)
+        self.records.join_videos()
+        rows, failed, doubted = self.records.write_tables()
+        self.writer.write_summary(rows, len(failed), len(doubted))
+        return RunReport(0, rows, rows - done, failed, seconds, self.notes, doubted)
+
+    def _depths(self, loaded: Iterable[tuple[Entry, Tensor | None]]) -> Iterator[_Reconstructed]:
+        """The frames of this rank with image and depth; those of a video once its first frames are there."""
+        recording: Recording | None = None
+        held: list[tuple[Entry, Tensor]] = []
+        video: Item | None = None
+        for frame, image in loaded:
+            if not frame.item.is_film or (image is None and frame.length is None):
+                if frame.mine:
+                    yield self._depth(self.image, frame, image)
+                continue
+            if frame.item != video:
+                video, recording, held = frame.item, None, []
+            if image is not None:
+                held.append((frame, image))
+            if recording is None and (frame.length is not None or len(held) >= self.settings.background_frames):
+                recording = self._recording(frame.item, held)
+            if recording is not None:
+                for one, of_video in held:
+                    if one.mine:
+                        yield self._depth(recording, one, of_video)
+                held = []
+            if frame.length is not None:
+                if text := cut_short(frame.item.file, frame.length):
+                    self.notes.append((frame.item.path, text))
+                yield frame, None, None
+
+    def _recording(self, item: Item, held: Sequence[tuple[Entry, Tensor]]) -> Recording:
+        """The recording of a video that begins with these frames."""
+        count = self.settings.background_frames
+        try:
+            if 0 < count <= len(held):
+                first = torch.cat([image for _, image in held])
+                return self.recording(first, codec=video_codec(item.file))
+            reason = f"background_frames: expected at least {count} frames, got {len(held)}" if count > 0 else ""
+        except ValueError as error:
+            reason = in_one_line(error)
+        if reason:
+            self.notes.append((item.path, f"first frames not used, the calibration is used as it is: {reason}"))
+        return self.recording()
+
+    def _depth(self, recording: Recording, frame: Entry, image: Tensor | None) -> _Reconstructed:
+        """Depth of one frame if it is wanted, or why there is none."""
+        if image is None:
+            return frame, None, None
+        try:
+            reason = recording.unusable(image)
+            if reason:
+                return frame._replace(failed=reason), None, None
+            if frame.done:
+                return frame, None, None
+            output = recording(image)
+            return frame._replace(doubt=recording.doubt), image, output
+        except ValueError as error:
+            return frame._replace(failed=in_one_line(error)), None, None
+
+    def _settle(self, frame: Entry, written: "Future[str]") -> None:
+        """Count a frame whose files are in place, or report why there are none."""
+        failed = written.result()  # a full disk is an OSError and stops the run
+        if failed:
+            name = frame.item.frame_name(frame.number)
+            if self.strict:
+                raise ValueError(f"{name}: {failed}")
+            self.failed += 1
+            if self.failed <= NAMED:
+                more = "" if self.failed < NAMED else "; further ones are named in failed.csv, at the end"
+                tqdm.write(f"left out {name}: {failed}{more}", file=sys.stderr)
+        else:
+            self.done += frame.length is None
+
+    def _write(self, frame: Entry, image: Tensor | None, result: DepthOutput | None) -> str:
+        """Write a frame's files, then its record; returns why there are none, or an empty text."""
+        figures: dict[str, Any] = {"failed": frame.failed}
+        if frame.length is not None:
+            figures = {"frames": frame.length}
+        elif image is not None and result is not None:
+            area = float(result.contact.double().sum()) * self.sensor.mm_per_pixel**2
+            figures = {"deepest_mm": float(result.depth_mm.max()), "contact_mm2": area, "doubt": frame.doubt}
+            try:
+                self.writer.write(frame, image, result)
+            except ValueError as error:  # a depth that its format does not hold
+                figures = {"failed": in_one_line(error)}
+        self.records.write(frame.item, frame.number, **figures)
+        return str(figures.get("failed", ""))

@@ -77,11 +77,9 @@ $(WASM): $(wildcard $(CSRC)/*.[ch]) $(if $(filter out/zig%,$(ZIG)),| out/zig)
 		-fvisibility=hidden $(filter-out %/sources.c %/track.c %/grids.c,$(wildcard $(CSRC)/*.c)) -o $@ \
 		-Wl,--export=malloc -Wl,--export=free -Wl,--export-dynamic -Wl,--strip-all
 
-# The page, in out/web: the folder web/, the library, and a drawn press with its plan. Any server of files shows it, such as
-# python -m http.server --directory out/web
+# The page, in out/web: the folder web/, the library, a drawn press, and a plan of each shipped prior. Any server of files shows it.
 web: setup $(WASM)
-	cp web/* out/web
-	$(BIN)/python scripts/web_demo.py --out out/web
+	$(BIN)/python scripts/web_page.py --out out/web
 
 clean:
 	rm -rf $(VENV) out .mypy_cache .ruff_cache .pytest_cache

@@ -18,9 +18,9 @@ from .options import add_background_frames, add_pipeline, add_sensor, contact_of
 from .parser import UsageError
 
 
-def add_source(parser: argparse.ArgumentParser) -> None:
+def add_source(parser: argparse.ArgumentParser, required: bool = True) -> None:
     """Options of the source, the unit, the camera and the pipeline."""
-    parser.add_argument("--source", required=True, help="camera (index, path, name, serial), video, folder, URL")
+    parser.add_argument("--source", required=required, help="camera (index, path, name, serial), video, folder, URL")
     parser.add_argument("--size", nargs=2, type=int, metavar=("W", "H"), help="of a camera's frames, where the driver takes it")
     parser.add_argument("--fps", type=float, metavar="F", help="of a camera, where the driver takes it")
     parser.add_argument("--exposure", type=float, metavar="E", help="of a camera, driver's unit; ends automatic exposure")

@@ -8,6 +8,7 @@ examples:
   torchvts view --source 0 --sensor gelsight_mini
   torchvts view --source /dev/video2 --calibration unit.safetensors --fps 30
   torchvts view --source video.avi --sensor gelsight_wedge --save ball.rrd
+  torchvts view --web
 """
 
 import argparse
@@ -18,15 +19,18 @@ from ..skin import motion_of_unit
 from ..stream import Keys, LiveView, StreamReport, TactileFrame, TactileStream, has_screen, require_rerun
 from ..stream.view import EXAGGERATION
 from ..viz import depth_figure, save_figure
+from .options import load_calibration
 from .parser import UsageError
 from .source import add_source, load_unit, open_stream, play
+from .web_page import serve
 
-USAGE = "--source SOURCE (--sensor NAME | --calibration FILE) [--save FILE.rrd]"
+USAGE = "(--source SOURCE (--sensor NAME | --calibration FILE) [--save FILE.rrd] | --web [--calibration FILE])"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the subcommand."""
-    add_source(parser)
+    add_source(parser, required=False)
+    parser.add_argument("--web", action="store_true", help="serve the page that measures in the browser, on this machine alone")
     parser.add_argument("--save", type=Path, metavar="FILE.rrd", help="record from the start; no viewer is opened")
     parser.add_argument("--out", type=Path, metavar="FOLDER", default=Path("out/view"), help="of snapshots and recordings")
     parser.add_argument(
@@ -40,6 +44,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Show the stream until the source ends or q is pressed, and print a summary."""
+    if arguments.web:
+        serve(None if arguments.calibration is None else load_calibration(arguments.calibration))
+        return 0
+    if arguments.source is None:
+        raise UsageError("expected --source SOURCE, or --web for the page in the browser")
     require_rerun()
     if arguments.save is None and not has_screen():
         raise UsageError("expected --save FILE.rrd, for this machine has no screen that the viewer could open on")

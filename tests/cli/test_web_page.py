@@ -15,7 +15,7 @@ from torchvts.cli import main, web_page
 from torchvts.compiled import library
 
 pytestmark = pytest.mark.skipif(library() is None, reason="no compiled library")
-BUILT = [path / "torchvts.wasm" for path in (web_page.PACKAGE / "web", web_page.PACKAGE.parent / "out" / "web")]
+BUILT = [folder / "web" / "torchvts.wasm" for folder in (web_page.PACKAGE, web_page.PACKAGE.parent)]
 
 
 def own_address():

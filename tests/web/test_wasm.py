@@ -36,7 +36,7 @@ pytestmark = pytest.mark.skipif(library() is None or shutil.which("node") is Non
 @pytest.fixture(scope="module")
 def wasm(tmp_path_factory):
     """The library: of this checkout's `make wasm`, or built by the zig that ZIG names."""
-    made = ROOT / "out" / "web" / "torchvts.wasm"
+    made = ROOT / "web" / "torchvts.wasm"
     command = ["make", "--silent", "-C", str(ROOT), "wasm"]
     zig = os.environ.get("ZIG")
     if zig is None and not (ROOT / "out" / "zig").is_dir():

@@ -69,14 +69,12 @@ def write_page(folder: Path, calibration: Calibration | None = None) -> None:
         FileNotFoundError: the library for browsers is neither in the package nor built in the checkout.
     """
     here = PACKAGE / "web" if (PACKAGE / "web").is_dir() else PACKAGE.parent / "web"
-    built = [path for path in (here / "torchvts.wasm", PACKAGE.parent / "out" / "web" / "torchvts.wasm") if path.is_file()]
-    if not built:
+    if not (here / "torchvts.wasm").is_file():
         why = "this torchvts was built without it; make wasm builds it in a checkout"
         raise FileNotFoundError(f"{here / 'torchvts.wasm'}: no such file: {why}")
     make_folder(folder)
-    for path in (*sorted(here.iterdir()), built[0]):
-        if path.resolve() != (folder / path.name).resolve():
-            shutil.copyfile(path, folder / path.name)
+    for path in here.iterdir():
+        shutil.copyfile(path, folder / path.name)
     write_plans(folder, calibration)
 
 

@@ -184,7 +184,7 @@ async function chooseType() {
   stopFilm();
   usePlan(await bytesOf(file), prior_deg === null);
   if (state.known) return say(`${name}, is in use. Now start the camera, or open images or a video of this unit.`);
-  say(`Depth by the prior of the type: slopes of a unit that it has not seen are ${prior_deg.toFixed(0)} degrees off in the mean. ${WITHOUT}`);
+  say(`Depth by the prior of the type: normals of a unit that it has not seen are ${prior_deg.toFixed(1)} degrees off in the mean. ${WITHOUT}`);
 }
 
 // ---- files ----

@@ -93,4 +93,4 @@ wheels: setup $(WASM) | out/zig
 	$(BIN)/python scripts/check_wheels.py out/wheels
 
 clean:
-	rm -rf $(VENV) out .mypy_cache .ruff_cache .pytest_cache
+	rm -rf $(VENV) $(WASM) out .mypy_cache .ruff_cache .pytest_cache

@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: setup demo test test-coverage test-long test-wheel check bench docs wasm web clean
+.PHONY: setup demo test test-coverage test-long test-wheel check bench docs wasm web wheels clean
 
 setup: $(VENV)/.done
 
@@ -60,28 +60,37 @@ bench: setup
 docs: setup
 	$(BIN)/python -m sphinx --fail-on-warning --keep-going --quiet docs out/docs
 
-# The compiled frame for browsers and Node, out/web/torchvts.wasm, by zig of PyPI in an environment of its own; ZIG=zig takes another.
-WASM := out/web/torchvts.wasm
+# The compiled frame for browsers and Node, web/torchvts.wasm, by zig of PyPI in an environment of its own; ZIG=zig takes another.
+WASM := web/torchvts.wasm
 CSRC := torchvts/compiled/csrc
-ZIG ?= out/zig/bin/python -m ziglang
+ZIG ?= $(CURDIR)/out/zig/bin/python -m ziglang
 
 wasm: $(WASM)
 
 out/zig:
 	$(PYTHON) -m venv $@
-	$@/bin/pip install --quiet --disable-pip-version-check "ziglang>=0.15" || (rm -rf $@; exit 1)
+	$@/bin/pip install --quiet --disable-pip-version-check "ziglang>=0.15" build "hatchling>=1.26" || (rm -rf $@; exit 1)
 
-$(WASM): $(wildcard $(CSRC)/*.[ch]) $(if $(filter out/zig%,$(ZIG)),| out/zig)
-	mkdir -p $(@D)
+$(WASM): $(wildcard $(CSRC)/*.[ch]) $(if $(filter $(CURDIR)/out/zig%,$(ZIG)),| out/zig)
 	$(ZIG) cc -target wasm32-wasi -msimd128 -mexec-model=reactor -std=c11 -O3 -fno-math-errno -fno-strict-aliasing -ffp-contract=off \
 		-fvisibility=hidden $(filter-out %/sources.c %/track.c %/grids.c,$(wildcard $(CSRC)/*.c)) -o $@ \
 		-Wl,--export=malloc -Wl,--export=free -Wl,--export-dynamic -Wl,--strip-all
 
-# The page, in out/web: the folder web/, the library, and a drawn press with its plan. Any server of files shows it, such as
-# python -m http.server --directory out/web
+# The page, in out/web: the folder web/, the library, a drawn press, and a plan of each shipped prior. Any server of files shows it.
 web: setup $(WASM)
-	cp web/* out/web
-	$(BIN)/python scripts/web_demo.py --out out/web
+	$(BIN)/python scripts/web_page.py --out out/web
+
+# A wheel with compiled code and the page for each of four platforms, in out/wheels, all by zig on this machine. The script says what each holds, and
+# runs those of this machine.
+WHEELS := x86_64-linux-gnu.2.17=manylinux_2_17_x86_64 aarch64-linux-gnu.2.17=manylinux_2_17_aarch64 aarch64-macos.11.0=macosx_11_0_arm64 \
+	x86_64-windows-gnu=win_amd64
+
+wheels: setup $(WASM) | out/zig
+	rm -rf out/wheels
+	out/zig/bin/python -m build --sdist --no-isolation --outdir out/wheels .
+	for one in $(WHEELS); do CC="$(ZIG) cc -target $${one%=*} -s" WHEEL_PLATFORM=$${one#*=} out/zig/bin/python -m pip wheel --quiet --no-deps --no-build-isolation \
+		--wheel-dir out/wheels out/wheels/torchvts-*.tar.gz || exit 1; done
+	$(BIN)/python scripts/check_wheels.py out/wheels
 
 clean:
-	rm -rf $(VENV) out .mypy_cache .ruff_cache .pytest_cache
+	rm -rf $(VENV) $(WASM) out .mypy_cache .ruff_cache .pytest_cache

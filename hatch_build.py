@@ -1,4 +1,8 @@
-"""Builds the compiled kernels in torchvts/compiled/csrc with the C compiler at hand; without one, PyTorch does their work."""
+"""Builds the compiled kernels in torchvts/compiled/csrc with the C compiler at hand; without one, PyTorch does their work.
+
+CC names another compiler. WHEEL_PLATFORM, such as manylinux_2_17_aarch64, names the platform that it builds for, if not this one:
+then a wheel without kernels is none.
+"""
 
 import os
 import shlex
@@ -28,10 +32,13 @@ class CompiledKernels(BuildHookInterface):
             self.app.display_warning(f"no C compiler {compiler[0]!r}: frames will take 2 to 7 times as long")
         else:
             self.build(compiler, folder, library)
+        platform = os.environ.get("WHEEL_PLATFORM")
         if not library.is_file():
+            if platform:
+                raise RuntimeError(f"WHEEL_PLATFORM: expected a compiler that builds for {platform}, got {compiler}, which failed")
             return
         build_data["pure_python"] = False
-        build_data["tag"] = "py3-none-" + sysconfig.get_platform().replace("-", "_").replace(".", "_")
+        build_data["tag"] = "py3-none-" + (platform or sysconfig.get_platform().replace("-", "_").replace(".", "_"))
 
     def build(self, compiler: list[str], folder: Path, library: Path) -> None:
         sources = [str(source) for source in sorted(folder.glob("*.c"))]

@@ -96,6 +96,8 @@ TABLE = {
     "FrozenPipeline.load": Entry({"path": ...}, {"path": [*MISSING, ".", 3, None]}, file=("path",), run=False),
     "FrozenPipeline.save": Entry(
         {"path": ...}, {"path": [*MISSING, ".", 3, None]}, lambda: pipe().freeze().save, file=("path",), run=False),
+    "FrozenPipeline.with_background": Entry({"background": image()}, {"background": images()},
+        lambda: vts.DepthPipeline.from_calibration(unit("response")).freeze().with_background),
     "FrozenPipeline.with_conditions": Entry({"images": image()[None]}, {"images": IMAGES}, lambda: pipe().freeze().with_conditions),
     "FillMarkers": Entry({"diameter_px": 9.0, "contrast": 0.06, "sigmas": 5.0, "margin": 0.2},
         {"diameter_px": ["9", None, NAN, -1], "contrast": NUMBER, "sigmas": NUMBER, "margin": NUMBER}),

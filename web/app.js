@@ -1,11 +1,15 @@
-// The page: a plan and images, or a video, to depth in 3D, its profile, and millimetres under the cursor.
+// The page: a plan and a camera, images or a video, to depth in 3D, its profile, and millimetres under the cursor.
 
+import { ROUGH, Resting, doubtOf, structure } from "./background.js";
 import { COLOURS } from "./colour.js";
+import { Rectify, cameras, openCamera } from "./frames.js";
+import { fileOf } from "./save.js";
 import { Surface } from "./surface.js";
 import { Plan, library } from "./torchvts.js";
 
 const $ = (id) => document.getElementById(id);
-export const state = { c: null, plan: null, images: [], at: 0, found: null, cross: null, video: null, surface: null };
+// known: whether the plan has the background of this unit; planes: the image that is shown, (3, height, width); film: the video or camera that plays
+export const state = { c: null, plan: null, known: true, plans: [], planes: null, images: [], at: 0, found: null, cross: null, film: null, frozen: false, surface: null };
 
 function say(text, bad = false) {
   $("status").textContent = text;
@@ -32,20 +36,47 @@ function pixelsOf(source, width, height) {
   return context.getImageData(0, 0, width, height);
 }
 
-function measure(source, width, height, name) {
-  const { plan } = state;
-  if (width !== plan.width || height !== plan.height) {
-    throw new Error(
-      `${name}: expected ${plan.width} x ${plan.height} pixels, as the plan, got ${width} x ${height}: open the plan of that ` +
-        "camera, or images that torchvts has rectified.",
-    );
+/** Takes a frame as its source gives it: the image in it, and its depth where the background is known. */
+function see(source, width, height, name) {
+  state.raw = `${width} x ${height}`;
+  state.planes = state.rectify.image(pixelsOf(source, width, height), name);
+  measure();
+}
+
+function measure() {
+  const { plan, planes } = state, n = plan.height * plan.width;
+  const pixels = new ImageData(plan.width, plan.height);
+  for (let k = 0; k < n; k++) {
+    for (let c = 0; c < 3; c++) pixels.data[4 * k + c] = 255 * planes[c * n + k];
+    pixels.data[4 * k + 3] = 255;
   }
-  const pixels = pixelsOf(source, width, height);
+  if (!state.known) {
+    drawMap("image", pixels);
+    $("take").disabled = Boolean(state.film?.resting);
+    return;
+  }
   const start = performance.now();
-  const found = plan.measure(pixels.data);
+  const found = plan.measure(planes);
   state.found = { ...found, pixels, ms: performance.now() - start };
-  $("save").disabled = false;
+  $("save").disabled = $("download").disabled = $("take").disabled = false;
   show();
+}
+
+// ---- the background ----
+
+/** The shown image, or the last frames of the camera, become the image without contact. */
+function takeBackground() {
+  const { plan, film } = state, image = film?.resting ? film.resting.image() : state.planes;
+  if (!film?.resting && structure(image, plan.height, plan.width) > ROUGH) {
+    throw new Error("Something touches the skin in this image: show one without contact, then take it.");
+  }
+  const made = plan.withBackground(image), doubt = doubtOf(image, plan, state.known);
+  plan.free();
+  Object.assign(state, { plan: made, known: true, rectify: new Rectify(made), background: image, found: null });
+  measure();
+  $("still").textContent = "";
+  const check = film?.resting ? " Browsers may change a camera's colours: press one ball of known size before you trust the millimetres." : "";
+  say(doubt ? `The background is taken, and in doubt: ${doubt}` : `The background is taken. Press something into the skin.${check}`, Boolean(doubt));
 }
 
 // ---- showing ----
@@ -59,7 +90,7 @@ function show() {
     touched += found.contact[k];
   });
   found.most = most > 0 ? most : 0.01;
-  state.cross ??= [deepest % width, Math.floor(deepest / width)];
+  found.deepest = [deepest % width, Math.floor(deepest / width)];
   const picture = new ImageData(width, height);
   found.depth.forEach((mm, k) => {
     const at = 4 * Math.round(255 * Math.min(1, Math.max(0, mm / found.most)));
@@ -69,20 +100,30 @@ function show() {
   $("most").textContent = `${found.most.toFixed(3)} ${plan.metric ? "mm" : "NOT mm"}`;
   const area = touched * plan.pitch * plan.pitch;
   $("what").textContent = `deepest ${most.toFixed(3)} ${unit()}, contact ${area.toFixed(1)} ${plan.metric ? "mm²" : ""}`;
-  $("rate").textContent = `${width} x ${height}, measured in ${found.ms.toFixed(1)} ms`;
+  const cut = state.raw === `${width} x ${height}` ? "" : ` of ${state.raw}`;
+  $("rate").textContent = `${width} x ${height}${cut}, measured in ${found.ms.toFixed(1)} ms`;
   state.surface?.show(found.depth, height, width, plan.pitch, found.most);
   drawMaps();
 }
 
+function drawMap(id, data) {
+  const canvas = $(id);
+  if (canvas.width !== data.width) canvas.width = data.width;
+  if (canvas.height !== data.height) canvas.height = data.height;
+  const context = canvas.getContext("2d");
+  context.putImageData(data, 0, 0);
+  return context;
+}
+
+/** Where the cross is: where a person put it, else at the deepest pixel. */
+const crossed = () => state.cross ?? state.found.deepest;
+
 function drawMaps() {
-  const { plan, found, cross } = state;
+  const { plan, found } = state;
   if (!found) return;
+  const cross = crossed();
   for (const [id, data] of [["image", found.pixels], ["depth", found.picture]]) {
-    const canvas = $(id);
-    if (canvas.width !== plan.width) canvas.width = plan.width;
-    if (canvas.height !== plan.height) canvas.height = plan.height;
-    const context = canvas.getContext("2d");
-    context.putImageData(data, 0, 0);
+    const context = drawMap(id, data);
     context.fillStyle = "rgba(255, 255, 255, 0.6)";
     context.fillRect(0, cross[1], plan.width, 1), context.fillRect(cross[0], 0, 1, plan.height);
   }
@@ -93,7 +134,7 @@ function drawMaps() {
 }
 
 function drawProfile() {
-  const { plan, found, cross } = state;
+  const { plan, found } = state, cross = crossed();
   const canvas = $("profile"), dense = window.devicePixelRatio || 1, style = getComputedStyle(document.body);
   const w = (canvas.width = canvas.clientWidth * dense), h = (canvas.height = canvas.clientHeight * dense);
   const context = canvas.getContext("2d");
@@ -106,7 +147,7 @@ function drawProfile() {
   context.textAlign = "right";
   for (const mm of [0, found.most / 2, found.most]) {
     context.beginPath(), context.moveTo(left, y(mm)), context.lineTo(w, y(mm)), context.stroke();
-    context.fillText(mm.toFixed(2), left - 6 * dense, y(mm) + 4 * dense);
+    context.fillText(mm.toFixed(found.most < 0.1 ? 3 : 2), left - 6 * dense, y(mm) + 4 * dense);
   }
   const across = plan.width * plan.pitch;
   for (const share of [0, 0.5, 1]) {
@@ -119,19 +160,34 @@ function drawProfile() {
   context.stroke();
 }
 
-// ---- files ----
+// ---- plans ----
 
-function usePlan(bytes) {
+/** known: false for a prior, which knows the type of a sensor and not this unit's background. */
+function usePlan(bytes, known = true) {
   const plan = new Plan(state.c, bytes);
   state.plan?.free();
-  Object.assign(state, { plan, found: null, cross: null, images: [], at: 0 });
+  Object.assign(state, { plan, known, rectify: new Rectify(plan), planes: null, background: null, found: null, cross: null, images: [], at: 0 });
   for (const id of ["what", "under", "row", "rate", "name", "most"]) $(id).textContent = "";
   for (const id of ["image", "depth", "profile"]) $(id).width = $(id).width; // clears it
   state.surface?.clear();
-  $("back").disabled = $("next").disabled = $("save").disabled = true;
+  for (const id of ["back", "next", "save", "take", "download"]) $(id).disabled = true;
   const scale = plan.metric ? "lengths in mm" : "the scale is NOT known";
   $("scale").textContent = `${plan.about.unit || "a unit"}, ${plan.about.mode}, ${(plan.pitch * 1000).toFixed(0)} µm a pixel, ${scale}`;
 }
+
+const WITHOUT = "Lift everything off the skin and keep it still, then take the background. Start the camera, or drop an image without contact.";
+
+/** A prior of the page, or a file of the user's. */
+async function chooseType() {
+  const { file, prior_deg, name } = state.plans[$("type").value] ?? {};
+  if (!file) return $("files").click();
+  stopFilm();
+  usePlan(await bytesOf(file), prior_deg === null);
+  if (state.known) return say(`${name}, is in use. Now start the camera, or open images or a video of this unit.`);
+  say(`Depth by the prior of the type: normals of a unit that it has not seen are ${prior_deg.toFixed(1)} degrees off in the mean. ${WITHOUT}`);
+}
+
+// ---- files ----
 
 async function showImage(at) {
   const { images } = state;
@@ -142,37 +198,81 @@ async function showImage(at) {
   });
   $("name").textContent = images.length > 1 ? `${file.name} (${state.at + 1} of ${images.length})` : file.name;
   $("back").disabled = $("next").disabled = images.length < 2;
-  measure(bitmap, bitmap.width, bitmap.height, file.name);
+  see(bitmap, bitmap.width, bitmap.height, file.name);
 }
 
-function stopVideo() {
-  if (!state.video) return;
-  state.video.pause();
-  URL.revokeObjectURL(state.video.src);
-  state.video = null;
+function stopFilm() {
+  const { film } = state;
+  if (!film) return;
+  film.video.pause();
+  film.stream?.getTracks().forEach((track) => track.stop());
+  URL.revokeObjectURL(film.video.src);
+  state.film = null, freeze(false);
+  $("still").textContent = "", $("start").textContent = "Start", $("freeze").disabled = true;
 }
 
-async function playVideo(file) {
-  const video = document.createElement("video");
-  Object.assign(video, { muted: true, loop: true, playsInline: true, src: URL.createObjectURL(file) });
-  state.video = video;
+/** Measures each frame of a video or a camera, until another takes its place. */
+async function play(film, name) {
+  const { video } = film;
+  state.film = film;
+  Object.assign(video, { muted: true, loop: true, playsInline: true });
   await new Promise((done, fail) => {
     video.onloadeddata = done;
-    video.onerror = () => fail(new Error(`${file.name}: no video that this browser plays: MP4 (H.264) and WebM are.`));
+    video.onerror = () => fail(new Error(`${name}: no video that this browser plays: MP4 (H.264) and WebM are.`));
+    setTimeout(() => fail(new Error(`${name}: no frame came in 10 seconds. ${film.stream ? "Plug the camera in again, then press Start." : "Record it again."}`)), 10000);
   });
-  $("name").textContent = file.name;
-  $("back").disabled = $("next").disabled = true;
-  let last = performance.now(), rate = 0;
-  const frame = told(async () => {
-    if (state.video !== video) return;
-    measure(video, video.videoWidth, video.videoHeight, file.name);
+  if (!video.videoWidth) throw new Error(`${name}: a video without frames, such as sound alone: open one that shows the sensor.`);
+  $("name").textContent = name;
+  $("back").disabled = $("next").disabled = true, $("freeze").disabled = false;
+  let last = performance.now(), rate = 0, count = 0;
+  const measured = () => {
+    see(video, video.videoWidth, video.videoHeight, name);
+    if (film.resting) watch(film, count++);
     const now = performance.now();
     rate = 0.9 * rate + 0.1 * (1000 / Math.max(1, now - last)), last = now;
-    $("rate").textContent += `, ${rate.toFixed(0)} frames a second`;
+    if (state.known) $("rate").textContent += `, ${rate.toFixed(0)} frames a second`;
+  };
+  const frame = told(() => {
+    if (state.film !== film) return;
+    try {
+      if (!state.frozen) measured();
+    } catch (error) {
+      stopFilm();
+      throw error;
+    }
     video.requestVideoFrameCallback(frame);
   });
   video.requestVideoFrameCallback(frame);
   await video.play();
+}
+
+/** Says whether the camera shows the skin at rest, every few frames. */
+function watch(film, count) {
+  film.resting.add(state.planes);
+  if (count % 6 === 0) film.why = film.resting.why(), $("still").textContent = film.why || `Still and untouched: take the background ${state.known ? "again, where depth at rest is not 0" : "now"}.`;
+  $("take").disabled = Boolean(film.why);
+}
+
+async function startCamera() {
+  if (state.film?.stream) return stopFilm();
+  stopFilm(), say("Allow the camera where the browser asks.");
+  const { plan } = state, stream = await openCamera($("camera").value, plan), track = stream.getVideoTracks()[0];
+  const video = document.createElement("video");
+  video.srcObject = stream;
+  track.onended = () => (stopFilm(), say("The camera has gone. Plug it in again, then press Start.", true));
+  $("start").textContent = "Stop";
+  await listCameras(track.getSettings().deviceId);
+  say(state.known ? "" : WITHOUT);
+  await play({ video, stream, resting: new Resting(plan.height, plan.width) }, track.label || "camera");
+}
+
+async function listCameras(chosen) {
+  $("camera").replaceChildren(...(await cameras()).map(([id, name]) => new Option(name, id, false, id === chosen)));
+}
+
+function freeze(frozen) {
+  state.frozen = frozen;
+  $("freeze").textContent = frozen ? "Go on" : "Freeze";
 }
 
 const open = told(async (files) => {
@@ -180,29 +280,31 @@ const open = told(async (files) => {
   const video = files.find((file) => file.type.startsWith("video/"));
   const images = files.filter((file) => file.type.startsWith("image/"));
   if (!plan && !video && !images.length) throw new Error("Expected a plan (.plan), images or a video, got none of them.");
-  stopVideo();
+  stopFilm();
   if (plan) {
     usePlan(new Uint8Array(await plan.arrayBuffer()));
-    say(`${plan.name} is in use. Now open images or a video of this unit.`);
+    $("type").value = "";
+    say(`${plan.name} is in use. Now start the camera, or open images or a video of this unit.`);
   }
-  if (video) return say(""), playVideo(video);
+  if (video) return say(state.known ? "" : WITHOUT), play({ video: Object.assign(document.createElement("video"), { src: URL.createObjectURL(video) }) }, video.name);
   if (images.length) {
     state.images = images.sort((a, b) => a.name.localeCompare(b.name, undefined, { numeric: true }));
-    say("");
+    say(state.known ? "" : "Show an image without contact (the arrows go from one to the next), then take it as background.");
     await showImage(0);
   }
 });
 
-function saveDepth() {
-  const { plan, found } = state;
-  const text = `{'descr': '<f4', 'fortran_order': False, 'shape': (${plan.height}, ${plan.width}), }`;
-  const head = new Uint8Array(128).fill(32);
-  head.set([0x93, 0x4e, 0x55, 0x4d, 0x50, 0x59, 1, 0, 118, 0]), head.set(new TextEncoder().encode(text), 10), head[127] = 10;
+function download(parts, name) {
   const link = document.createElement("a");
-  link.href = URL.createObjectURL(new Blob([head, found.depth]));
-  link.download = "depth_mm.npy";
+  link.href = URL.createObjectURL(new Blob(parts));
+  link.download = name;
   link.click();
   setTimeout(() => URL.revokeObjectURL(link.href), 1000);
+}
+
+async function saveDepth() {
+  const { plan, found } = state, kind = $("kind").value;
+  download(await fileOf(kind, found.depth, plan), `depth_mm.${kind}`);
 }
 
 // ---- hands ----
@@ -225,13 +327,26 @@ function listen() {
   }
   $("depth").addEventListener("keydown", (event) => {
     const step = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] }[event.key];
-    if (step && state.cross) moveCross(state.cross[0] + step[0], state.cross[1] + step[1]), event.preventDefault();
+    if (step && state.found) moveCross(crossed()[0] + step[0], crossed()[1] + step[1]), event.preventDefault();
   });
   $("open").addEventListener("click", () => $("files").click());
   $("files").addEventListener("change", () => open([...$("files").files]));
   $("back").addEventListener("click", told(() => showImage(state.at - 1)));
   $("next").addEventListener("click", told(() => showImage(state.at + 1)));
-  $("save").addEventListener("click", saveDepth);
+  $("save").addEventListener("click", told(saveDepth));
+  $("mine").addEventListener("click", () => {
+    $("sensor").hidden = !$("sensor").hidden;
+    $("mine").setAttribute("aria-expanded", String(!$("sensor").hidden));
+  });
+  $("type").addEventListener("change", told(chooseType));
+  $("start").addEventListener("click", told(async () => startCamera().catch((error) => (stopFilm(), Promise.reject(error)))));
+  $("camera").addEventListener("change", told(async () => state.film?.stream && (stopFilm(), await startCamera())));
+  $("take").addEventListener("click", told(takeBackground));
+  $("freeze").addEventListener("click", () => freeze(!state.frozen));
+  $("download").addEventListener("click", () => download([state.plan.bytes()], "unit.plan"));
+  document.addEventListener("keydown", (event) => {
+    if (event.key === " " && event.target === document.body && state.film) freeze(!state.frozen), event.preventDefault();
+  });
   $("times").addEventListener("input", () => {
     $("timesOut").textContent = $("times").value;
     if (state.surface) state.surface.times = Number($("times").value), state.surface.draw();
@@ -258,8 +373,11 @@ told(async () => {
   state.c = await library(await bytesOf("torchvts.wasm"));
   $("bar").getContext("2d").putImageData(new ImageData(COLOURS.slice(), 256, 1), 0, 0);
   usePlan(await bytesOf("demo.plan"));
+  state.plans = JSON.parse(new TextDecoder().decode(await bytesOf("plans.json")));
+  $("type").append(...state.plans.map(({ name }, k) => new Option(name, k)));
+  await listCameras();
   const demo = new File([await bytesOf("demo.png")], "a drawn press", { type: "image/png" });
-  say("A ball pressed into a drawn sensor. Drop a plan of your unit (pipe.freeze().save(\"unit.plan\")) and its images here.");
+  say("A ball pressed into a drawn sensor. Plug in yours, or drop a plan of it (pipe.freeze().save(\"unit.plan\")) and its images here.");
   try {
     state.surface = new Surface($("surface"));
   } catch (error) {
@@ -268,5 +386,6 @@ told(async () => {
   state.images = [demo];
   await showImage(0);
   listen();
+  await navigator.serviceWorker?.register("worker.js"); // then the page opens without a network
   document.body.dataset.ready = "yes";
 })();

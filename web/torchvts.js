@@ -1,7 +1,7 @@
 // Depth by a plan in WebAssembly: torchvts/compiled/csrc/torchvts.h as a class. Works in browsers and in Node.
 
 const REASON = 256;
-const RGB8 = 0;
+const RGB8 = 0, FLOAT = 2;
 
 /** The compiled library; `bytes` of torchvts.wasm. */
 export async function library(bytes) {
@@ -17,16 +17,21 @@ export async function library(bytes) {
 export class Plan {
   constructor(library, bytes) {
     this.c = library;
-    const reason = this.take(REASON);
     const file = this.take(bytes.length);
     new Uint8Array(library.memory.buffer).set(bytes, file);
-    this.handle = library.vts_load(file, bytes.length, reason);
+    this.hold((reason) => library.vts_load(file, bytes.length, reason), file);
+  }
+
+  /** Holds what `make` gives, and frees what it was made of; throws the reason if it gives none. */
+  hold(make, from) {
+    const library = this.c, reason = this.take(REASON);
+    this.handle = make(reason);
     const why = this.handle ? "" : this.text(reason);
-    library.free(file), library.free(reason);
+    library.free(from), library.free(reason);
     if (!this.handle) throw new Error(why);
     Object.assign(this, this.facts());
     const pixels = this.height * this.width;
-    this.image = this.take(3 * pixels);
+    this.image = this.take(12 * pixels);
     this.depth = this.take(4 * pixels);
     this.contact = this.take(pixels);
     this.output = this.take(24);
@@ -55,25 +60,62 @@ export class Plan {
       height: view.getInt32(8, true),
       width: view.getInt32(12, true),
       metric: view.getInt32(16, true) !== 0,
+      file: [view.getUint32(28, true), view.getUint32(32, true)], // where its bytes lie, and how many
       about,
     };
     this.c.free(at);
     return found;
   }
 
-  /** Depth in mm and contact of an image of bytes R, G, B, A (height, width, 4), as a canvas gives it. */
-  measure(rgba) {
-    const pixels = this.height * this.width;
-    if (rgba.length !== 4 * pixels) {
-      throw new Error(`Expected an image of ${this.width} x ${this.height} pixels, as the plan, got one of ${rgba.length / 4} pixels.`);
+  /** Puts an image where the library reads it; returns its format. */
+  put(image) {
+    const pixels = this.height * this.width, planes = image instanceof Float32Array;
+    if (image.length !== (planes ? 3 : 4) * pixels) {
+      const got = image.length / (planes ? 3 : 4);
+      throw new Error(`Expected an image of ${this.width} x ${this.height} pixels, as the plan, got one of ${got} pixels.`);
+    }
+    if (planes) {
+      new Float32Array(this.c.memory.buffer, this.image, 3 * pixels).set(image);
+      return FLOAT;
     }
     const to = new Uint8Array(this.c.memory.buffer, this.image, 3 * pixels);
     for (let k = 0; k < pixels; k++) {
-      to[3 * k] = rgba[4 * k];
-      to[3 * k + 1] = rgba[4 * k + 1];
-      to[3 * k + 2] = rgba[4 * k + 2];
+      to[3 * k] = image[4 * k];
+      to[3 * k + 1] = image[4 * k + 1];
+      to[3 * k + 2] = image[4 * k + 2];
     }
-    const code = this.c.vts_depth(this.handle, this.image, RGB8, this.output);
+    return RGB8;
+  }
+
+  /** The plan of the same unit with another image without contact, see measure(). This one stays. */
+  withBackground(image) {
+    const format = this.put(image), made = Object.create(Plan.prototype);
+    made.c = this.c;
+    made.hold((reason) => this.c.vts_background(this.handle, this.image, format, reason), 0);
+    return made;
+  }
+
+  /** The bytes of the plan's file. */
+  bytes() {
+    return new Uint8Array(this.c.memory.buffer, ...this.file).slice();
+  }
+
+  /** A table of floats of the plan, by its name: docs/plan.md states how they lie. */
+  table(name) {
+    const bytes = this.bytes(), view = new DataView(bytes.buffer), lines = (size) => Math.ceil(size / 64) * 64;
+    for (let at = 64 + lines(view.getUint32(28, true)); at < bytes.length; ) {
+      const found = new TextDecoder().decode(bytes.subarray(at, at + 32)).replace(/\0.*/, "");
+      const count = Number(view.getBigUint64(at + 40, true)), each = { f: 4, d: 8, i: 8, b: 1 }[String.fromCharCode(bytes[at + 32])];
+      if (found === name) return new Float32Array(bytes.buffer, at + 64, count);
+      at += 64 + lines(count * each);
+    }
+    return null;
+  }
+
+  /** Depth in mm and contact of an image: bytes R, G, B, A (height, width, 4), as a canvas gives it, or Float32Array (3, height, width) in [0, 1]. */
+  measure(image) {
+    const pixels = this.height * this.width, format = this.put(image);
+    const code = this.c.vts_depth(this.handle, this.image, format, this.output);
     if (code !== 0) throw new Error(this.text(this.c.vts_error(code)));
     return {
       depth: new Float32Array(this.c.memory.buffer, this.depth, pixels).slice(),

@@ -1,5 +1,5 @@
 /* Damages a plan file many times and reads it: fuzz_plan FILE COUNT SEED. Half of the damaged files get a checksum that fits, so that the checks behind
-   it are reached; a frame is then reconstructed. Built with sanitizers, which end the program at the first report. A damaged file without a new checksum
+   it are reached; a frame is then reconstructed, and is a new background. Built with sanitizers, which end the program at the first report. A damaged file without a new checksum
    must be refused. Prints how many were read, refused, and accepted as they were not written. */
 #include "torchvts.h"
 
@@ -96,7 +96,9 @@ int main(int count, char **words) {
         for (size_t k = 0; k < 3 * pixels; k++) image[k] = (unsigned char)(below(16) ? 60 + k % 90 : below(256));
         const vts_output output = {.depth_mm = depth};
         if (vts_depth(plan, image, VTS_RGB8, &output) > VTS_NO_MEMORY) wrong++;
-        free(image), free(depth), vts_free(plan);
+        vts_plan *other = vts_background(plan, image, VTS_BGR8, reason); /* of point lights there is none */
+        if (!other && !strlen(reason)) wrong++, printf("no background, without a reason\n");
+        vts_free(other), free(image), free(depth), vts_free(plan);
     }
     free(good), free(bad);
     printf("read %ld, refused %ld, wrong %ld\n", read, refused, wrong);

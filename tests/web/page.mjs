@@ -1,9 +1,11 @@
-// Opens the page in Chromium by its DevTools protocol and does what a person would: page.mjs CHROMIUM URL FOLDER. Prints what it saw, as JSON.
+// Opens the page in Chromium by its DevTools protocol and does what a person would: page.mjs WHAT CHROMIUM URL FOLDER. Prints what it saw, as JSON.
 import { spawn } from "node:child_process";
 import { writeFileSync } from "node:fs";
 
-const [chromium, url, folder] = process.argv.slice(2);
-const flags = ["--headless=new", "--no-sandbox", "--enable-unsafe-swiftshader", "--use-angle=swiftshader", "--remote-debugging-port=0"];
+const [what, chromium, url, folder] = process.argv.slice(2);
+const CAMERA = ["--use-fake-device-for-media-stream", `--use-file-for-fake-video-capture=${folder}/camera.y4m`];
+const SPECIAL = { walk: CAMERA, plain: ["--js-flags=--no-enable-sse4-1 --no-enable-ssse3"] };
+const flags = ["--headless=new", "--no-sandbox", "--enable-unsafe-swiftshader", "--use-angle=swiftshader", "--remote-debugging-port=0", ...(SPECIAL[what] ?? [])];
 const browser = spawn(chromium, [...flags, `--user-data-dir=${folder}/profile`, "about:blank"], { stdio: ["ignore", "ignore", "pipe"] });
 const sleep = (ms) => new Promise((done) => setTimeout(done, ms));
 let said = "", last = 0;
@@ -24,9 +26,20 @@ const send = (method, params = {}) =>
     answers.set(++last, done);
     socket.send(JSON.stringify({ id: last, method, params }));
   });
-const evaluate = async (expression) => (await send("Runtime.evaluate", { expression, awaitPromise: true, returnByValue: true })).result?.value;
+const evaluate = async (expression) => (await send("Runtime.evaluate", { expression, awaitPromise: true, returnByValue: true, userGesture: true })).result?.value;
 const text = (id) => evaluate(`document.getElementById("${id}").textContent`);
-const depth = () => evaluate(`import("./app.js").then(({ state }) => state.found && [...state.found.depth])`);
+const base64 = `(floats) => btoa(Array.from(new Uint8Array(floats.buffer), (byte) => String.fromCharCode(byte)).join(""))`;
+const array = (of) => evaluate(`import("./app.js").then(({ state }) => state.found && (${base64})(state.${of}))`);
+const depth = () => array("found.depth");
+const click = (id) => evaluate(`document.getElementById("${id}").click()`);
+const choose = (id, value) => evaluate(`{ const one = document.getElementById("${id}"); one.value = "${value}"; one.dispatchEvent(new Event("change")); }`);
+async function until(expression, seconds = 30) {
+  for (let k = 0; k < 10 * seconds; k++) {
+    if (await evaluate(expression)) return;
+    await sleep(100);
+  }
+  throw new Error(`never: ${expression}; the page says: ${await text("status")} ${await text("still")}`);
+}
 const press = async (id, key) => {
   await evaluate(`document.getElementById("${id}").focus()`);
   await send("Input.dispatchKeyEvent", { type: "keyDown", key }), await send("Input.dispatchKeyEvent", { type: "keyUp", key });
@@ -44,12 +57,11 @@ async function picture(name, width, height, theme) {
   const { data } = await send("Page.captureScreenshot");
   writeFileSync(`${folder}/${name}.png`, Buffer.from(data, "base64"));
 }
+const ready = () => until(`document.body?.dataset.ready === "yes"`);
 
-try {
-  for (const part of ["Page", "Runtime", "DOM"]) await send(`${part}.enable`);
-  await send("Page.navigate", { url });
-  for (let k = 0; (await evaluate("document.body?.dataset.ready")) !== "yes" && k < 150; k++) await sleep(200);
-  const seen = { demo: await depth(), under: await text("under"), drawn: await text("what") };
+/** The drawn press, a plan with its images and a film, and what is refused. */
+async function files(seen) {
+  Object.assign(seen, { demo: await depth(), under: await text("under"), drawn: await text("what") });
   await press("depth", "ArrowRight");
   seen.right = await text("under");
   await picture("light", 1280, 680, "light"), await picture("dark", 1280, 680, "dark"), await picture("phone", 390, 1300, "dark");
@@ -60,10 +72,70 @@ try {
   seen.unit = await depth(), seen.about = await text("scale");
   await picture("unit", 1280, 680, "light");
   seen.refused = [];
-  for (const name of ["light.png", "bad.plan", "none.txt", "none.png"]) await open(name), seen.refused.push(await text("status"));
+  for (const name of ["light.png", "bad.plan", "none.txt", "none.png", "sound.webm"]) await open(name), seen.refused.push(await text("status"));
   await open("film.webm"), await sleep(1500);
   seen.film = await text("rate"), seen.name = await text("name"), seen.said = await text("status"), seen.what = await text("what");
-  seen.errors = errors;
+}
+
+/** A sensor by the prior of its type: background, press, freeze, what is saved. */
+async function sensor(seen) {
+  await click("mine");
+  const type = await evaluate(`[...document.getElementById("type").options].find((one) => one.text.startsWith("gelsight_mini")).value`);
+  await choose("type", type);
+  await until(`document.getElementById("status").textContent.includes("by the prior")`);
+  seen.prior = await text("status");
+  await send("Browser.setPermission", { permission: { name: "camera" }, setting: "denied" });
+  await click("start"), await until(`document.getElementById("status").textContent.includes("refused")`);
+  seen.denied = await text("status");
+  await send("Browser.setPermission", { permission: { name: "camera" }, setting: "granted" });
+  await evaluate(`document.getElementById("camera").append(new Option("one that was unplugged", "none", true, true))`);
+  await click("start"), await until(`document.getElementById("status").textContent.includes("gone")`);
+  seen.gone = await text("status");
+  await evaluate(`document.getElementById("camera").replaceChildren()`), await click("start");
+  await until(`document.getElementById("still").textContent.includes("touches") || document.getElementById("still").textContent.includes("moves")`);
+  seen.touched = await text("still");
+  await until(`document.getElementById("still").textContent.startsWith("Still") && !document.getElementById("take").disabled`);
+  seen.still = await text("still"), seen.cameras = await evaluate(`document.getElementById("camera").textContent`);
+  await picture("waiting", 1280, 760, "light");
+  await until(`document.getElementById("still").textContent.startsWith("Still") && !document.getElementById("take").disabled`);
+  await click("take");
+  await until(`Number(document.getElementById("what").textContent.split(" ")[1]) > 0.2 && !document.getElementById("freeze").click()`);
+  Object.assign(seen, { taken: await text("status"), rate: await text("rate"), frozen: await text("freeze") });
+  Object.assign(seen, { background: await array("background"), planes: await array("planes"), depth: await depth() });
+  await picture("sensor", 1280, 760, "light"), await picture("sensor_dark", 1280, 760, "dark"), await picture("sensor_phone", 390, 1500, "light");
+  seen.wider = await evaluate("document.documentElement.scrollWidth");
+  await send("Browser.setDownloadBehavior", { behavior: "allow", downloadPath: `${folder}/saved` });
+  for (const kind of ["npy", "png", "ply"]) await choose("kind", kind), await click("save"), await sleep(500);
+  await click("download"), await sleep(1000);
+  await click("start");
+  seen.stopped = await text("start");
+}
+
+/** Images in place of a camera: the one that is shown becomes the background. */
+async function dropped(seen) {
+  const type = await evaluate(`[...document.getElementById("type").options].find((one) => one.text.startsWith("gelsight_mini")).value`);
+  await choose("type", type), await sleep(1000);
+  await open("image.png"), await click("take"), await sleep(500);
+  seen.contact = await text("status");
+  await open("a_rest.png", "b_press.png");
+  seen.before = await depth();
+  await click("take"), await sleep(500), await click("next"), await sleep(1000);
+  seen.next = await depth();
+}
+
+try {
+  for (const part of ["Page", "Runtime", "DOM"]) await send(`${part}.enable`);
+  await send("Page.navigate", { url });
+  const seen = { errors };
+  if (what === "walk") await ready(), await files(seen), await sensor(seen), await dropped(seen);
+  if (what === "offline") await ready(), (seen.demo = await depth());
+  if (what === "none") {
+    await ready(), await send("Browser.setPermission", { permission: { name: "camera" }, setting: "granted" }), await click("start");
+    await until(`!/Allow|ball/.test(document.getElementById("status").textContent)`);
+  }
+  if (what === "plain") await until(`!document.getElementById("status").textContent.startsWith("Starting")`);
+  if (what === "file") await sleep(2000);
+  seen.status = (await text("status")).replace(/\s+/g, " ");
   console.log(JSON.stringify(seen));
 } finally {
   socket.close(), browser.kill();

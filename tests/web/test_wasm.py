@@ -36,7 +36,7 @@ pytestmark = pytest.mark.skipif(library() is None or shutil.which("node") is Non
 @pytest.fixture(scope="module")
 def wasm(tmp_path_factory):
     """The library: of this checkout's `make wasm`, or built by the zig that ZIG names."""
-    made = ROOT / "out" / "web" / "torchvts.wasm"
+    made = ROOT / "web" / "torchvts.wasm"
     command = ["make", "--silent", "-C", str(ROOT), "wasm"]
     zig = os.environ.get("ZIG")
     if zig is None and not (ROOT / "out" / "zig").is_dir():
@@ -59,6 +59,43 @@ def measured(wasm, folder, frozen, image):
     size = image.shape[1:]
     depth = np.fromfile(folder / "depth.f32", np.float32).reshape(size)
     return torch.from_numpy(depth), torch.from_numpy(np.fromfile(folder / "contact.u8", np.uint8).reshape(size) > 0), said
+
+
+RECTIFY = """
+import { readFileSync, writeFileSync } from "node:fs";
+import { Rectify } from "./frames.js";
+const [folder, plan, width, height] = [process.argv[2], ...process.argv.slice(3).map(JSON.parse)];
+const data = readFileSync(folder + "/raw.rgba"), rectify = new Rectify(plan);
+writeFileSync(folder + "/image.f32", rectify.image({ data, width, height }));
+let why = "";
+try { rectify.image({ data, width: 10, height }, "raw"); } catch (error) { why = error.message; }
+console.log(why);
+"""
+VIEWS = {
+    "cropped": vts.Sensor.load("gelsight_mini"),
+    "turned": vts.Sensor.load("digit"),
+    "enlarged": vts.Sensor("enlarged", 60, 80, 0.2, turn_deg=270, mirror=True, raw_size_px=[[64, 48]]),
+    "a region": vts.Sensor("region", 60, 80, 0.2, turn_deg=180, roi_px=(10, 20, 160, 120)),
+}
+
+
+@pytest.mark.parametrize("kind", VIEWS)
+def test_frames_are_rectified_as_in_python(tmp_path, kind):
+    sensor = VIEWS[kind]
+    height, width = sensor.raw_size_px[-1] if sensor.raw_size_px else (240, 200)
+    raw = torch.randint(0, 256, (height, width, 4), dtype=torch.uint8, generator=torch.Generator().manual_seed(4))
+    (tmp_path / "raw.rgba").write_bytes(raw.numpy().tobytes())
+    (tmp_path / "package.json").write_text('{"type": "module"}')
+    shutil.copy(ROOT / "web" / "frames.js", tmp_path)
+    (tmp_path / "rectify.mjs").write_text(RECTIFY)
+    plan = {"height": sensor.height, "width": sensor.width, "about": {"view": sensor.view._asdict()}}
+    words = [json.dumps(value) for value in (plan, width, height)]
+    command = ["node", str(tmp_path / "rectify.mjs"), str(tmp_path), *words]
+    why = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+    found = torch.from_numpy(np.fromfile(tmp_path / "image.f32", np.float32)).reshape(3, sensor.height, sensor.width)
+    expected = sensor.rectify(raw[..., :3].permute(2, 0, 1)[None] / 255.0)[0]
+    assert float((found - expected).abs().max()) < 1e-6
+    assert why.startswith("raw: ")
 
 
 @pytest.mark.parametrize("mode", ["fast", "precise"])

@@ -28,9 +28,9 @@ def add_sensor(parser: argparse._ActionsContainer, text: str = "") -> None:
     parser.add_argument("--sensor", metavar="NAME", help=f"{text}YAML file, or one of {', '.join(shipped_sensors())}")
 
 
-def add_unit(parser: argparse._ActionsContainer, inputs: str) -> None:
+def add_unit(parser: argparse._ActionsContainer, inputs: str, required: bool = True) -> None:
     """The files of a command that reads frames: a calibration, then ``inputs``; or inputs alone, and ``--sensor`` calibrates."""
-    parser.add_argument("files", nargs="+", metavar="FILE", help=f"calibration, then {inputs}; with --sensor only these")
+    parser.add_argument("files", nargs="+" if required else "*", metavar="FILE", help=f"calibration, then {inputs}; with --sensor only these")
     add_sensor(parser, "calibrate first: ")
     parser.add_argument("--background", type=Path, nargs="+", metavar="IMAGE", help="to calibrate: without contact; or a video")
     add_press(parser)

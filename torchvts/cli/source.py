@@ -25,9 +25,9 @@ from .options import add_pipeline, add_unit, calibrated, contact_of, split_files
 from .parser import UsageError
 
 
-def add_source(parser: argparse.ArgumentParser) -> None:
+def add_source(parser: argparse.ArgumentParser, required: bool = True) -> None:
     """Options of the source, the unit, the camera and the pipeline."""
-    add_unit(parser, "a camera, video, folder or URL")
+    add_unit(parser, "a camera, video, folder or URL", required)
     parser.add_argument("--size", nargs=2, type=int, metavar=("W", "H"), help="of a camera's frames, where the driver takes it")
     parser.add_argument("--fps", type=float, metavar="F", help="of a camera, where the driver takes it")
     parser.add_argument("--exposure", type=float, metavar="E", help="of a camera, driver's unit; ends automatic exposure")

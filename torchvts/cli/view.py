@@ -8,6 +8,7 @@ examples:
   torchvts view 0 --sensor gelsight_mini
   torchvts view unit.safetensors /dev/video2 --fps 30
   torchvts view video.avi --sensor gelsight_wedge --save ball.rrd
+  torchvts view --web
 """
 
 import argparse
@@ -18,15 +19,18 @@ from ..skin import motion_of_unit
 from ..stream import Keys, LiveView, StreamReport, TactileFrame, TactileStream, has_screen, require_rerun
 from ..stream.view import EXAGGERATION
 from ..viz import depth_figure, save_figure
+from .options import load_calibration
 from .parser import UsageError
 from .source import add_source, load_unit, open_stream, play
+from .web_page import serve
 
-USAGE = "CALIBRATION SOURCE [--save FILE.rrd]"
+USAGE = "(CALIBRATION SOURCE [--save FILE.rrd] | --web [CALIBRATION])"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the subcommand."""
-    add_source(parser)
+    add_source(parser, required=False)
+    parser.add_argument("--web", action="store_true", help="serve the page that measures in the browser, on this machine alone")
     parser.add_argument("--save", type=Path, metavar="FILE.rrd", help="record from the start; no viewer is opened")
     parser.add_argument("--out", type=Path, metavar="FOLDER", default=Path("out/view"), help="of snapshots and recordings")
     parser.add_argument(
@@ -40,6 +44,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Show the stream until the source ends or q is pressed, and print a summary."""
+    if arguments.web:
+        if len(arguments.files) > 1:
+            raise UsageError(f"expected at most a calibration beside --web, got {' '.join(arguments.files)}")
+        serve(load_calibration(Path(arguments.files[0])) if arguments.files else None)
+        return 0
+    if not arguments.files:
+        raise UsageError("expected CALIBRATION SOURCE, or --web for the page in the browser")
     require_rerun()
     if arguments.save is None and not has_screen():
         raise UsageError("expected --save FILE.rrd, for this machine has no screen that the viewer could open on")

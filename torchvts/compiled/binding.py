@@ -14,6 +14,7 @@ SIGNATURES = {
     "vts_load": "p p l p",
     "vts_info": "v p p",
     "vts_depth": "i p p i p",
+    "vts_background": "p p p i p",
     "vts_free": "v p",
     "alignment_sums": "v p i i p l i i p p",
     "part_sums": "v p i i p l i i p p",

@@ -111,9 +111,10 @@ def compensate_values(block: nn.Module, size: tuple[int, int]) -> Values:
 def _light_values(linear: nn.ModuleList) -> Values:
     """The light of camera values, as a table, where the last step before linear light is the camera's gamma."""
     if not ends_in_gamma(linear):
-        return {"light_of": None, "lights": 0}
+        return {"exponent": 1.0, "light_of": None, "lights": 0}
     check_block("compensate.linear", linear[-1], Linearise)
-    return {"light_of": linear[-1](torch.linspace(0.0, 1.0, LIGHTS, dtype=torch.float64)).float(), "lights": LIGHTS}
+    light = linear[-1](torch.linspace(0.0, 1.0, LIGHTS, dtype=torch.float64)).float()
+    return {"exponent": linear[-1].gamma, "light_of": light, "lights": LIGHTS}
 
 
 def ends_in_gamma(linear: nn.ModuleList) -> bool:

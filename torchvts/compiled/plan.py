@@ -6,7 +6,7 @@ import json
 import struct
 import weakref
 import zlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import torch
@@ -112,8 +112,12 @@ class Plan:
     """
 
     def __init__(self, content: bytes) -> None:
+        self._hold(lambda reason: loaded().vts_load(content, len(content), reason))
+
+    def _hold(self, made: Callable[[Any], int | None]) -> None:
+        """Hold the plan that a function of the library makes, or raise with the reason that it writes."""
         reason = ctypes.create_string_buffer(256)
-        self._handle = loaded().vts_load(content, len(content), reason)
+        self._handle = made(reason)
         if not self._handle:
             raise PlanError(reason.value.decode())
         weakref.finalize(self, loaded().vts_free, self._handle)
@@ -131,6 +135,16 @@ class Plan:
         facts = PlanFacts()
         loaded().vts_info(self._handle, ctypes.addressof(facts))
         return facts
+
+    def with_background(self, image: Tensor) -> "Plan":
+        """The plan of the same unit with another image without contact, (3, H, W) contiguous float32.
+
+        Raises:
+            PlanError: the library's reason.
+        """
+        made = Plan.__new__(Plan)
+        made._hold(lambda reason: loaded().vts_background(self._handle, image.data_ptr(), FLOAT_PLANES, reason))
+        return made
 
     def content(self) -> bytes:
         """The bytes of the file."""

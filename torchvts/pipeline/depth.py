@@ -90,7 +90,8 @@ class DepthPipeline(nn.Module):
             )
         self.mode = mode
         self.mm_per_pixel = mm_per_pixel
-        self._unit, self._metric = "", False  # of no calibration: nothing is known of the scale
+        self._sensor: Sensor | None = None  # of no calibration: nothing is known of the camera or the scale
+        self._metric = False
         self.compensate = compensate
         self.mask = mask
         self.solve = Solve(model, gradient, integrator, ZeroBackground(mm_per_pixel))
@@ -159,7 +160,7 @@ class DepthPipeline(nn.Module):
             )
             touching = ContactFromDepth.from_calibration(calibration, settings)
             pipe = cls(*modules, mm_per_pixel=sensor.mm_per_pixel, mode=mode, contact=touching)
-            pipe._unit, pipe._metric = sensor.name, calibration.metric
+            pipe._sensor, pipe._metric = sensor, calibration.metric
             return eval_around(pipe, *given)
 
     @classmethod

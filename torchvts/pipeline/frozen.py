@@ -14,7 +14,7 @@ from ..compensate import Compensate
 from ..compiled import NotCompiled, Plan, PlanError, check_block, library, plan_bytes, why_no_library
 from ..compiled import blocks as compiled
 from ..core import __version__
-from ..core.checks import check_batch, check_path, check_range, check_record, check_same_size
+from ..core.checks import check_batch, check_image, check_path, check_range, check_record, check_same_size
 from ..core.files import MOST_TENSOR_BYTES, write_atomically
 from ..core.frame import Conditions, DepthOutput
 from .depth import DepthPipeline
@@ -99,16 +99,9 @@ class FrozenPipeline:
             ValueError: what is not compiled, or printed markers, which PyTorch fills.
             OSError: it cannot be written there.
         """
-        if self._plan is None:
-            why = f"got one in PyTorch, because {self.not_compiled}"
-            raise ValueError(f"pipe: expected one that is compiled, {why}: torchvts.export writes others")
-        if len(self._before):
-            raise ValueError(
-                "pipe: expected a skin without printed markers, got one whose markers PyTorch fills before the compiled code: "
-                "torchvts.export.export_torchscript writes a file that holds them"
-            )
+        plan = self._check_plan()
         with write_atomically(path) as temporary:
-            temporary.write_bytes(self._plan.content())
+            temporary.write_bytes(plan.content())
 
     @classmethod
     def load(cls, path: str | Path) -> "FrozenPipeline":
@@ -134,15 +127,48 @@ class FrozenPipeline:
         if library() is None:
             raise RuntimeError(f"{path}: a plan needs the compiled library, and there is none: {why_no_library()}")
         try:
-            return cls._of(path.read_bytes())
+            return cls._of(Plan(path.read_bytes()))
         except PlanError as error:
             raise ValueError(f"{path}: {error}") from error
 
     @classmethod
-    def _of(cls, content: bytes) -> "FrozenPipeline":
-        plan, found = Plan(content), cls.__new__(cls)
+    def _of(cls, plan: Plan) -> "FrozenPipeline":
+        found = cls.__new__(cls)
         found._hold(None, plan, [], "", str(plan.about.get("mode", "unknown")), plan.mm_per_pixel)
         return found
+
+    def with_background(self, background: Tensor) -> "FrozenPipeline":
+        """The same unit with another image without contact, as of a later day: by the plan alone, in C; this one stays as it is.
+
+        What :func:`torchvts.stream.with_background` does with the calibration, for units by a response field.
+
+        Args:
+            background: (3, H, W) in [0, 1].
+        Raises:
+            ValueError: another shape, values outside [0, 1], no light; or a unit by point lights, printed markers, or a pipeline
+                that is not compiled.
+        Example:
+            >>> frozen = FrozenPipeline.load("unit.plan").with_background(background)  # doctest: +SKIP
+        """
+        plan = self._check_plan()
+        check_image("background", background, *plan.size, str(plan.about.get("unit")))
+        try:
+            found = plan.with_background(background.detach().to("cpu", torch.float32).contiguous())
+        except PlanError as error:
+            raise ValueError(f"background: {error}") from error
+        return self._of(found)
+
+    def _check_plan(self) -> Plan:
+        """The plan, or raise where it does not say all of a frame."""
+        if self._plan is None:
+            why = f"got one in PyTorch, because {self.not_compiled}"
+            raise ValueError(f"pipe: expected one that is compiled, {why}: torchvts.export writes others")
+        if len(self._before):
+            raise ValueError(
+                "pipe: expected a skin without printed markers, got one whose markers PyTorch fills before the compiled code: "
+                "torchvts.export.export_torchscript writes a file that holds them"
+            )
+        return self._plan
 
     def __setattr__(self, name: str, value: object) -> None:
         raise AttributeError(f"{name}: a frozen pipeline cannot change: change the pipeline, or make another, and freeze that")
@@ -153,7 +179,7 @@ class FrozenPipeline:
     def __reduce__(self) -> tuple[Any, ...]:
         if self._pipe is None:
             assert self._plan is not None
-            return FrozenPipeline._of, (self._plan.content(),)
+            return _of_bytes, (self._plan.content(),)
         return FrozenPipeline, (self._pipe,)
 
     def __repr__(self) -> str:
@@ -235,6 +261,10 @@ class FrozenPipeline:
         check_same_size("images", images, "the calibration", *self._plan.size)
 
 
+def _of_bytes(content: bytes) -> FrozenPipeline:
+    return FrozenPipeline._of(Plan(content))
+
+
 def _finish(pool: ThreadPoolExecutor) -> None:
     """Wait for the frames that are being worked on, which takes milliseconds, and leave out the others, whatever is raised."""
     try:
@@ -245,9 +275,13 @@ def _finish(pool: ThreadPoolExecutor) -> None:
 
 
 def about(pipe: DepthPipeline) -> dict[str, object]:
-    """What a plan says of itself, for people."""
-    made_by = f"torchvts {__version__} on {platform.system()} {platform.machine()}"
-    return {"unit": pipe._unit, "metric": pipe._metric, "length": "mm", "mode": pipe.mode, "made_by": made_by}
+    """What a plan says of itself: for people, and how its images lie in the frames of the camera."""
+    made_by, sensor = f"torchvts {__version__} on {platform.system()} {platform.machine()}", pipe._sensor
+    found = {"metric": pipe._metric, "length": "mm", "mode": pipe.mode, "made_by": made_by}
+    if sensor is None:
+        return found | {"unit": "", "view": None}
+    view = sensor.view._asdict()
+    return found | {"unit": view.pop("name"), "view": {name: value for name, value in view.items() if name != "size"}}
 
 
 def values_of(pipe: DepthPipeline) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-/* A plan file, read and checked: docs/plan.md states its layout. Nothing in it is believed: sizes of tables follow from the numbers of a plan, which
+/* A plan file, read and checked, and written: docs/plan.md states its layout. Nothing in it is believed: sizes of tables follow from the numbers of a plan, which
    have ranges; every value is finite; every index lies in the image. */
 #include "load.h"
 
@@ -56,8 +56,7 @@ typedef struct {
 
 _Static_assert(sizeof(Head) == LINE && sizeof(Record) == LINE, "both fill a line");
 
-/* Writes a reason; returns 0. */
-static int refuse(char *reason, const char *format, ...) {
+int refuse(char *reason, const char *format, ...) {
     va_list values;
     va_start(values, format);
     vsnprintf(reason, VTS_REASON, format, values);
@@ -94,19 +93,20 @@ static int check_head(const uint8_t *bytes, size_t size, char *reason) {
     return 1;
 }
 
+static char kind_of(const Field *field) { return field->type == NUMBER ? field->whole ? 'i' : 'd' : KINDS[field->type]; }
+
 static size_t whole_lines(size_t bytes) { return (bytes + LINE - 1) / LINE * LINE; }
 
 /* Reads the records: numbers into the plan, and where tables lie; count: values of each. */
 static int read_records(const uint8_t *bytes, size_t size, size_t at, Plan *plan, uint64_t *count, char *reason) {
     for (int k = 0; k < COUNT; k++) {
         const Field *field = FIELDS + k;
-        const char kind = field->type == NUMBER ? field->whole ? 'i' : 'd' : KINDS[field->type];
         Record record;
         if (at > size || size - at < sizeof record) return refuse(reason, "%s: expected it in the plan, which ends before", field->name);
         memcpy(&record, bytes + at, sizeof record);
         at += sizeof record;
         if (strncmp(record.name, field->name, sizeof record.name)) return refuse(reason, "%s: expected it as field %d of the plan, got another", field->name, k);
-        if (record.kind != kind) return refuse(reason, "%s: expected values of kind %c, got others", field->name, kind);
+        if (record.kind != kind_of(field)) return refuse(reason, "%s: expected values of kind %c, got others", field->name, kind_of(field));
         count[k] = record.count;
         if (record.count > (size - at) / BYTES[field->type]) return refuse(reason, "%s: expected %llu values, and the plan ends before", field->name, (unsigned long long)record.count);
         void *to = (char *)plan + field->place;
@@ -210,4 +210,32 @@ int read_plan(const uint8_t *bytes, size_t size, Plan *plan, size_t *about_size,
     *about_size = head.about - 1;
     return read_records(bytes, size, sizeof head + whole_lines(head.about), plan, count, reason) && check_ranges(plan, reason) && check_rules(plan, reason) &&
            check_sizes(plan, count, reason) && check_values(plan, count, reason);
+}
+
+uint8_t *write_plan(const Plan *p, const char *about, size_t about_size, size_t *size) {
+    const int64_t sizes[] = {ALL_FIELDS(NUMBER_SIZE, NUMBER_SIZE, TABLE_SIZE, TABLE_SIZE)};
+    const void *values[COUNT];
+    Head head = {"VTSPLAN\n", PLAN_VERSION, 0, sizeof head + whole_lines(about_size + 1), COUNT, (uint32_t)about_size + 1, {0}};
+    for (int k = 0; k < COUNT; k++) {
+        values[k] = (const char *)p + FIELDS[k].place;
+        if (FIELDS[k].type != NUMBER) memcpy(values + k, values[k], sizeof values[k]);
+        head.size += sizeof(Record) + (values[k] ? whole_lines((size_t)sizes[k] * BYTES[FIELDS[k].type]) : 0);
+    }
+    uint8_t *bytes = calloc(1, (size_t)head.size), *to = bytes;
+    if (!bytes) return NULL;
+    memcpy(bytes + sizeof head, about, about_size);
+    to += sizeof head + whole_lines(about_size + 1);
+    for (int k = 0; k < COUNT; k++) {
+        Record record = {.kind = kind_of(FIELDS + k), .count = values[k] ? (uint64_t)sizes[k] : 0};
+        const size_t length = (size_t)record.count * BYTES[FIELDS[k].type];
+        memcpy(record.name, FIELDS[k].name, strlen(FIELDS[k].name));
+        memcpy(to, &record, sizeof record), to += sizeof record;
+        if (length) memcpy(to, values[k], length);
+        to += whole_lines(length);
+    }
+    memcpy(bytes, &head, sizeof head);
+    head.checksum = checksum(bytes + 16, (size_t)head.size - 16);
+    memcpy(bytes, &head, sizeof head);
+    *size = (size_t)head.size;
+    return bytes;
 }

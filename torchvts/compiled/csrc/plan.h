@@ -23,8 +23,8 @@ enum { MOST_SIDE = 16384, MOST_PIXELS = 1 << 26, MOST_TAPS = 1025, MOST_WAVES = 
 #define IMAGE_FIELDS(INTEGER, REAL, TABLE, OPTION)                                                                                            \
     /* metric: 1 where lengths are mm, 0 where their scale is not known */                                                                    \
     INTEGER(height, 2, MOST_SIDE) INTEGER(width, 2, MOST_SIDE) REAL(mm_per_pixel, 1e-9) INTEGER(metric, 0, 1)                                 \
-    /* compensate.c; light of the values k / (lights - 1), or none; maps (3, height, width); defect (defects), neighbours (.., 4) */          \
-    INTEGER(lights, 0, 1 << 20) TABLE(float, light_of, p->lights)                                                                             \
+    /* compensate.c; light is value^exponent; light of the values k / (lights - 1), or none; maps (3, height, width); defect (defects), neighbours (.., 4) */          \
+    REAL(exponent, 1e-9) INTEGER(lights, 0, 1 << 20) TABLE(float, light_of, p->lights)                                                                             \
     OPTION(float, gain, 3 * PIXELS) OPTION(float, offset, 3 * PIXELS) TABLE(float, pedestal, 3)                                               \
     INTEGER(defects, 0, MOST_PIXELS) TABLE(int64_t, defect, p->defects) TABLE(int64_t, neighbours, 4 * p->defects)                            \
     INTEGER(blur_taps, 0, MOST_TAPS) TABLE(float, blur, p->blur_taps)                                                                         \

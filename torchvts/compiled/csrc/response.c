@@ -27,7 +27,7 @@ static inline __attribute__((always_inline)) void sines(const float *restrict im
             cube[5] = rb * term[2], cube[6] = gg * term[1], cube[7] = gg * term[2], cube[8] = gb * term[2], cube[9] = bb * term[2];
         }
         float x = 0.0f, y = 0.0f;
-        for (int power = degree; power >= 0; power--) {
+        UNROLLED for (int power = degree; power >= 0; power--) {
             const float *at = weight + 2 * terms * power;
             float along = at[0] * term[0], down = at[terms] * term[0];
             UNROLLED for (int i = 1; i < terms; i++) along += at[i] * term[i], down += at[terms + i] * term[i];

@@ -75,19 +75,20 @@ static WIDE void planes_of(const uint8_t *restrict image, size_t pixels, int fir
         for (size_t k = 0; k < pixels; k++) planes[c * pixels + k] = (float)image[3 * k + (size_t)(first ? first - c : c)] / 255.0f;
 }
 
+static int in_range(const float *planes, size_t pixels) {
+    float ends[2];
+    range(planes, 3 * pixels, ends);
+    return ends[0] >= 0.0f && ends[1] <= 1.0f;
+}
+
 static int frame(const Plan *plan, Scratch *scratch, const void *image, int format, const vts_output *to) {
     const size_t pixels = (size_t)plan->height * plan->width;
     float *own = lend(scratch, 6 * sizeof(float) * pixels), *planes = format == VTS_FLOAT ? NULL : lend(scratch, 3 * sizeof(float) * pixels);
     uint8_t *masks = lend(scratch, 2 * pixels);
-    float conditions[22], ends[2];
+    float conditions[22];
     if (!own || !masks || (format != VTS_FLOAT && !planes)) return VTS_NO_MEMORY;
-    if (planes) {
-        planes_of(image, pixels, format == VTS_BGR8 ? 2 : 0, planes);
-        image = planes;
-    } else {
-        range(image, 3 * pixels, ends);
-        if (!(ends[0] >= 0.0f && ends[1] <= 1.0f)) return VTS_BAD_VALUES;
-    }
+    if (planes) planes_of(image, pixels, format == VTS_BGR8 ? 2 : 0, planes), image = planes;
+    else if (!in_range(image, pixels)) return VTS_BAD_VALUES;
     const int code = reconstruct(plan, scratch, image, to->conditions ? to->conditions : conditions, to->depth_mm ? to->depth_mm : own,
                                  to->gradient ? to->gradient : own + pixels, to->normal ? to->normal : own + 3 * pixels,
                                  to->contact ? to->contact : masks, to->deformed ? to->deformed : masks + pixels);
@@ -101,6 +102,20 @@ int vts_depth(vts_plan *plan, const void *image, int format, const vts_output *o
     const int code = frame(&plan->plan, scratch, image, format, output);
     put_scratch(plan, scratch);
     return code;
+}
+
+vts_plan *vts_background(const vts_plan *plan, const void *image, int format, char reason[VTS_REASON]) {
+    if (!plan || !image || format < VTS_RGB8 || format > VTS_FLOAT) return refuse(reason, "%s", vts_error(VTS_BAD_ARGUMENT)), NULL;
+    const size_t pixels = (size_t)plan->plan.height * plan->plan.width;
+    if (format == VTS_FLOAT && !in_range(image, pixels)) return refuse(reason, "%s", vts_error(VTS_BAD_VALUES)), NULL;
+    float *planes = malloc(3 * sizeof(float) * pixels);
+    if (!planes) return short_of_memory(reason);
+    if (format != VTS_FLOAT) planes_of(image, pixels, format == VTS_BGR8 ? 2 : 0, planes), image = planes;
+    size_t size;
+    uint8_t *bytes = with_background(&plan->plan, image, (const char *)plan->bytes + LINE, plan->about_size, &size, reason);
+    vts_plan *made = bytes ? vts_load(bytes, size, reason) : NULL;
+    free(bytes), free(planes);
+    return made;
 }
 
 const char *vts_error(int code) {

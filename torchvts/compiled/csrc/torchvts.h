@@ -48,10 +48,11 @@ typedef struct {
 } vts_output;
 
 enum { VTS_DONE, VTS_NO_MEMORY, VTS_BAD_ARGUMENT, VTS_BAD_VALUES };
-
 /* Depth of an image of the size that vts_info() says; VTS_DONE, or a code that vts_error() puts into a sentence. */
 VTS_API int vts_depth(vts_plan *plan, const void *image, int format, const vts_output *output);
 VTS_API const char *vts_error(int code);
+/* A plan of the same unit with another image without contact; the old one stays, and both are freed. Null, and a reason, where there can be none. */
+VTS_API vts_plan *vts_background(const vts_plan *plan, const void *image, int format, char reason[VTS_REASON]);
 
 #ifdef __cplusplus
 }

@@ -45,13 +45,22 @@ def test_transparency_is_left_out(tmp_path):
     "pixels, message",
     [
         (np.zeros((5, 6), np.uint8), r"expected a colour image, got one of shape \(5, 6\): three lights need three channels"),
-        (np.zeros((5, 6, 3), np.float32), "expected 8 or 16 bits per channel, got float32"),
+        (np.full((5, 6, 3), 300.0, np.float32), r"expected values in \[0, 1\] or \[0, 255\], got 300 to 300: scale them before"),
+        (np.full((5, 6, 3), np.nan, np.float32), r"expected values in \[0, 1\] or \[0, 255\], got nan to nan"),
+        (np.full((5, 6, 3), 1020, np.uint16), "expected 16 bits that reach beyond 4095, got at most 1020: 8, 10 or 12 bits in 16"),
+        (np.zeros((5, 6, 3), np.int16), "expected 8 or 16 bits per channel, got int16"),
     ],
 )
 def test_other_images_are_refused(tmp_path, pixels, message):
     cv2.imwrite(str(tmp_path / "image.tiff"), pixels)
     with pytest.raises(ValueError, match=message):
         vts.read_image(tmp_path / "image.tiff")
+
+
+@pytest.mark.parametrize("scale, dtype", [(1.0, np.float32), (255.0, np.float32), (1.0, np.float64)])
+def test_floats_are_read_as_the_levels_they_hold(tmp_path, scale, dtype):
+    cv2.imwrite(str(tmp_path / "float.tiff"), (picture().flip(0).permute(1, 2, 0).numpy() * scale).astype(dtype))
+    assert torch.equal(vts.read_image(tmp_path / "float.tiff"), picture())
 
 
 @pytest.mark.parametrize("content", [b"", b"not an image", b"\x89PNG\r\n\x1a\n"])

@@ -5,7 +5,7 @@ import warnings
 from typing import NamedTuple
 
 from ..core.checks import check_integer, check_positive
-from ..core.recordings import lossy_codec
+from ..core.videos import lossy_codec
 from .sources import CameraReader
 
 

@@ -75,7 +75,7 @@ def video(unit, tmp_path_factory):
     "name, error, message",
     [
         ("none.avi", FileNotFoundError, "source: .*no such file or folder"),
-        ("text.txt", ValueError, "source: .*expected a video or an image"),
+        ("text.txt", ValueError, "source: .*expected a video, an image or a container"),
         ("empty", ValueError, "source: .*no images"),
         ("damaged.avi", ValueError, "source: .*not a video"),
     ],

@@ -13,12 +13,12 @@ from typing import Any, NamedTuple, Protocol
 from torch import Tensor
 
 from ..core.checks import brief, check_integer, check_least, check_path, check_positive, parse_number
+from ..core.containers import find_container
 from ..core.files import IMAGE_SUFFIXES, REMEDIES, VIDEO_SUFFIXES, Pixels, check_text_name, rgb_from_bgr
 from ..core.recordings import (
     RawFrame,
     cut_short,
     image_files,
-    is_film,
     raw_frames,
     video_codec,
     video_rate,
@@ -323,7 +323,7 @@ def frames(source: str | int | Path) -> Iterator[tuple[str, Tensor]]:
         [('0', torch.Size([3, 4, 6])), ('1', torch.Size([3, 4, 6]))]
     """
     path = None if isinstance(source, int) else check_path("source", source)
-    if path is not None and (path.exists() or is_film(path)) and find_camera(str(path)) is None:
+    if path is not None and (path.exists() or find_container(path)) and find_camera(str(path)) is None:
         return ((frame.name, rgb_from_bgr(frame.read())) for frame in raw_frames(path))
     return _of_camera(open_source(source))
 
@@ -363,7 +363,7 @@ def open_source(source: str | int | Path, reconnect_s: float = 0.0) -> Reader:
     if isinstance(source, str) and source.lower().startswith(URLS):
         return LiveReader(lambda: CameraReader(source), reconnect_s)
     path = Path(text)
-    if path.is_dir() or is_film(path):
+    if path.is_dir() or find_container(path):
         return FileReader(path)
     if find_camera(text) is not None:
         return LiveReader(lambda: CameraReader(_index_of(text)), reconnect_s)  # found again: it may come back as another

@@ -248,15 +248,24 @@ def test_depth_in_a_corner_behind_a_lens():
         ({"corners_px": ((0, 0), (300, 0), (300, 210), (0, 210))}, (120, 160), "frame: 120 x 160 does not contain corners_px"),
         (
             {},
-            (48, 64),
-            "frame: expected 24 x 32 for sensor 'rig', got 48 x 64: resize it, load the sensor with height=48, width=64, "
-            "or give it roi_px: .0, 0, 64, 48.",
+            (36, 48),
+            "frame: expected 24 x 32 for sensor 'rig', got 36 x 48: resize it, load the sensor with height=36, width=48, "
+            "or give it roi_px: .0, 0, 48, 36.",
         ),
     ],
 )
 def test_a_frame_that_does_not_fit_is_refused(options, size, message):
     with pytest.raises(ValueError, match=message):
         vts.Sensor(**GOOD, **options).rectify(torch.zeros(1, 3, *size))
+
+
+def test_a_frame_of_twice_the_resolution_is_scaled_with_a_sentence():
+    raw = torch.rand(1, 3, 48, 64)
+    with pytest.warns(UserWarning, match=r"48 x 64, 2 times the resolution of sensor 'rig', is scaled.*raw_size_px: \[\[48, 64"):
+        image = vts.Sensor(**GOOD).rectify(raw)
+    assert torch.equal(image, vts.Sensor(**GOOD, raw_size_px=((48, 64),)).rectify(raw))
+    with pytest.raises(ValueError, match="got 48 x 64"):
+        vts.Sensor(**GOOD, mirror=True).rectify(raw)
 
 
 def test_the_wedge_video_is_rectified_to_its_gel(data):

@@ -42,7 +42,7 @@ REMEDIES = {
 IN_COLOUR = 6
 """OpenCV's IMREAD_ANYDEPTH | IMREAD_ANYCOLOR: grey stays grey, 16 bits stay 16, and an image that its EXIF tag turns is turned."""
 
-DARK = 4095
+MOST_OF_12_BITS = 4095
 """An image of 16 bits whose values stay below this is black, or of 12 bits."""
 
 MOST_BYTES = 2**29
@@ -216,9 +216,12 @@ def _check_still(path: Path) -> None:
     """Refuse a file of several frames, of which only the first would be read."""
     with path.open("rb") as stream:
         head = stream.read(64)
-    remedy = "save its frames as PNG, as a TIFF of several pages or as a video without loss"
-    if head[:4] == b"GIF8":
-        raise ValueError(f"{path}: expected an image of 8 bits a channel, got a GIF, which keeps 256 colours: {remedy}")
+    remedy = "save frames as PNG in true colour, as a TIFF of several pages or as a video without loss"
+    indexed = {"a GIF": head[:4] == b"GIF8", "a PNG with a palette": head[12:16] == b"IHDR" and head[25] == 3}
+    indexed["a BMP with a palette"] = head[:2] == b"BM" and 0 < int.from_bytes(head[28:30], "little") <= 8
+    for kind, is_it in indexed.items():
+        if is_it:
+            raise ValueError(f"{path}: expected an image of 8 bits a channel, got {kind}, which keeps 256 colours: {remedy}")
     if (head[8:16] == b"WEBPVP8X" and head[20] & 2) or b"acTL" in head:
         raise ValueError(f"{path}: expected one image, got an animation: {remedy}")
     if path.suffix.lower() in PAGED_SUFFIXES and (count := len(page_places(path))) > 1:
@@ -269,9 +272,10 @@ def whole_levels(pixels: np.ndarray[Any, Any], path: Path) -> Pixels:
     Raises:
         ValueError: other values; or 16 bits so dark that only 8, 10 or 12 of them seem used, whose scale cannot be known.
     """
-    if pixels.dtype == np.uint16 and int(pixels.max(initial=0)) <= DARK:
+    most = int(pixels.max(initial=0)) if pixels.dtype == np.uint16 else MOST_OF_12_BITS + 1
+    if most <= MOST_OF_12_BITS:
         raise ValueError(
-            f"{path}: expected 16 bits that reach beyond {DARK}, got at most {int(pixels.max(initial=0))}: 8, 10 or 12 bits in 16? "
+            f"{path}: expected 16 bits that reach beyond {MOST_OF_12_BITS}, got at most {most}: 8, 10 or 12 bits stored in 16? "
             "multiply them by 257, 64 or 16; or it is black"
         )
     if pixels.dtype.kind == "f":

@@ -15,8 +15,16 @@ $(VENV)/.done: pyproject.toml constraints.txt hatch_build.py $(wildcard torchvts
 	$(BIN)/python -m compileall -qq -j 0 -x 'testing/_internal|/tests/|/plotly/' $(VENV)/lib/python3*/site-packages torchvts || true
 	touch $@
 
-demo: setup
-	$(BIN)/python scripts/demo.py --out out/demo
+# Needs the package alone: in .venv where it is there, else in an environment of its own.
+DEMO := $(if $(wildcard $(VENV)/.done),$(VENV),out/venv)
+
+demo: $(DEMO)/.done
+	$(DEMO)/bin/python scripts/demo.py --out out/demo
+
+out/venv/.done: pyproject.toml constraints.txt
+	$(PYTHON) -m venv out/venv
+	out/venv/bin/pip install --quiet --disable-pip-version-check --constraint constraints.txt .
+	touch $@
 
 # A few minutes on two cores. A worker that has no tests left takes some of another's, so that none waits.
 PYTEST := $(BIN)/python -m pytest -n auto --dist worksteal

@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: setup demo test test-coverage test-long test-wheel check bench docs wasm web clean
+.PHONY: setup demo test test-coverage test-long test-wheel check bench docs release wasm web clean
 
 setup: $(VENV)/.done
 
@@ -67,6 +67,20 @@ bench: setup
 # The documentation as HTML in out/docs, from docs/ and the docstrings; a warning is an error.
 docs: setup
 	$(BIN)/python -m sphinx --fail-on-warning --keep-going --quiet docs out/docs
+
+# What is to be published, in out/release/dist: source and wheel, README rendered as the index does, and the wheel tried in an environment
+# that has nothing else. Nothing is tagged or uploaded.
+RELEASE := out/release
+
+release:
+	rm -rf $(RELEASE)
+	$(PYTHON) -m venv $(RELEASE)/tools
+	$(RELEASE)/tools/bin/pip install --quiet --disable-pip-version-check build twine
+	$(RELEASE)/tools/bin/python -m build --outdir $(RELEASE)/dist .
+	$(RELEASE)/tools/bin/twine check --strict $(RELEASE)/dist/*
+	$(PYTHON) -m venv $(RELEASE)/empty
+	$(RELEASE)/empty/bin/pip install --quiet --disable-pip-version-check --constraint $(CONSTRAINTS) $(RELEASE)/dist/*.whl
+	cd $(RELEASE) && empty/bin/torchvts --version && empty/bin/python -c "import torchvts; print(*torchvts.shipped_sensors())"
 
 # The compiled frame for browsers and Node, out/web/torchvts.wasm, by zig of PyPI in an environment of its own; ZIG=zig takes another.
 WASM := out/web/torchvts.wasm

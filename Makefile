@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: setup demo test test-coverage test-long test-wheel check bench docs wasm web wheels clean
+.PHONY: setup demo test test-coverage test-long test-wheel check bench docs release wasm web wheels clean
 
 setup: $(VENV)/.done
 
@@ -15,8 +15,16 @@ $(VENV)/.done: pyproject.toml constraints.txt hatch_build.py $(wildcard torchvts
 	$(BIN)/python -m compileall -qq -j 0 -x 'testing/_internal|/tests/|/plotly/' $(VENV)/lib/python3*/site-packages torchvts || true
 	touch $@
 
-demo: setup
-	$(BIN)/python scripts/demo.py --out out/demo
+# Needs the package alone: in .venv where it is there, else in an environment of its own.
+DEMO := $(if $(wildcard $(VENV)/.done),$(VENV),out/venv)
+
+demo: $(DEMO)/.done
+	$(DEMO)/bin/python scripts/demo.py --out out/demo
+
+out/venv/.done: pyproject.toml constraints.txt
+	$(PYTHON) -m venv out/venv
+	out/venv/bin/pip install --quiet --disable-pip-version-check --constraint constraints.txt .
+	touch $@
 
 # A few minutes on two cores. A worker that has no tests left takes some of another's, so that none waits.
 PYTEST := $(BIN)/python -m pytest -n auto --dist worksteal
@@ -59,6 +67,20 @@ bench: setup
 # The documentation as HTML in out/docs, from docs/ and the docstrings; a warning is an error.
 docs: setup
 	$(BIN)/python -m sphinx --fail-on-warning --keep-going --quiet docs out/docs
+
+# What is to be published, in out/release/dist: source and wheel, README rendered as the index does, and the wheel tried in an environment
+# that has nothing else. Nothing is tagged or uploaded.
+RELEASE := out/release
+
+release:
+	rm -rf $(RELEASE)
+	$(PYTHON) -m venv $(RELEASE)/tools
+	$(RELEASE)/tools/bin/pip install --quiet --disable-pip-version-check build twine
+	$(RELEASE)/tools/bin/python -m build --outdir $(RELEASE)/dist .
+	$(RELEASE)/tools/bin/twine check --strict $(RELEASE)/dist/*
+	$(PYTHON) -m venv $(RELEASE)/empty
+	$(RELEASE)/empty/bin/pip install --quiet --disable-pip-version-check --constraint $(CONSTRAINTS) $(RELEASE)/dist/*.whl
+	cd $(RELEASE) && empty/bin/torchvts --version && empty/bin/python -c "import torchvts; print(*torchvts.shipped_sensors())"
 
 # The compiled frame for browsers and Node, web/torchvts.wasm, by zig of PyPI in an environment of its own; ZIG=zig takes another.
 WASM := web/torchvts.wasm

@@ -5,12 +5,14 @@ labels.csv, otherwise from calibration. --all scores the drawn sensors and the r
 
 python scripts/accuracy.py presses/ --sensor gelsight_mini --methods precise MLP
 python scripts/accuracy.py --sets digit_a gelsight_pale --out out/accuracy
+python scripts/accuracy.py --all --normals my_networks:normals
 """
 
 import shlex
 import sys
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from tqdm import tqdm
@@ -19,6 +21,7 @@ from lab import evaluate as ev
 from lab import sets
 from lab.commands import main_of, parser_of
 from lab.figures import set_figure
+from lab.methods import own_methods
 from torchvts import Sensor, viz
 
 
@@ -29,6 +32,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--sets", nargs="+", choices=sets.SETS, metavar="SET", help=f"of {', '.join(sets.SETS)}")
     names = ", ".join(f'"{name}"' for name in ev.COMPARED)
     parser.add_argument("--methods", nargs="+", default=[], choices=ev.COMPARED, metavar="METHOD", help=f"of {names}")
+    factory = "MODULE:FACTORY"
+    parser.add_argument("--normals", metavar=factory, help="your module: factory(training) gives compensated images to normals")
+    parser.add_argument("--depth", metavar=factory, help="your network: factory(training) gives images to depth in mm")
     parser.add_argument("--limit", type=int, metavar="N", help="at most so many presses (of each ball of --sets)")
     parser.add_argument("--out", type=Path, default=Path("out/accuracy"), help="for table.md, scores.json and pictures")
     own = parser.add_argument_group("of a folder")
@@ -41,13 +47,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     if arguments.folder is None and arguments.network is not None:
         parser.error("--network: expected FOLDER beside it, the presses of the network's unit")
     start = time.perf_counter()
-    methods, limit = arguments.methods, arguments.limit
+    methods, limit, own = arguments.methods, arguments.limit, own_methods(arguments.normals, arguments.depth)
     if arguments.folder is None:
         names = sets.SETS if arguments.all else arguments.sets
-        done = ev.evaluate_all(names, sets.data_folder(), methods, limit=limit, progress=True)
+        done = ev.evaluate_all(names, sets.data_folder(), methods, limit=limit, own=own, progress=True)
     else:
         sensor = Sensor.load(arguments.sensor)
         data = sets.from_folder(arguments.folder, sensor, folds=arguments.folds, network=arguments.network, limit=limit)
+        data = replace(data, methods=(*data.methods, *own))
         with tqdm(desc="evaluating", leave=False, disable=None) as bar:
             done = [ev.evaluate(data, methods, bar=bar)]
     print(ev.write_tables(done, arguments.out, shlex.join(["python", "scripts/accuracy.py", *(argv or sys.argv[1:])])))

@@ -95,6 +95,7 @@ def evaluate_all(
     methods: Sequence[str] = (),
     *,
     limit: int | None = None,
+    own: tuple[Method, ...] = (),
     progress: bool = False,
 ) -> list[Evaluation]:
     """Score methods on several sets; a set that cannot be read is one row with the reason.
@@ -104,6 +105,7 @@ def evaluate_all(
         folder: folder of the real sets.
         methods: names out of :data:`COMPARED`; empty for :data:`IN_TABLE`.
         limit: use only so many presses of each ball.
+        own: methods beside these, see :func:`lab.methods.own_methods`.
         progress: show a bar.
     Raises:
         ValueError: an unknown method.
@@ -114,6 +116,7 @@ def evaluate_all(
             bar.set_postfix_str(f"{name}, reading")
             try:
                 data = load(name, folder, limit)
+                data = dataclasses.replace(data, methods=(*data.methods, *own))
             except Exception as error:  # the other sets are still scored
                 row = Row("presses", "", name, note=_reason(error))
                 done.append(Evaluation(DataSet(name, torch.zeros(3, 1, 1), (), ""), [row], [], None, {}))

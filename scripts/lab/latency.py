@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from torchvts.core.checks import check_integer, check_positive
-from torchvts.core.recordings import Pixels
+from torchvts.core.files import Pixels
 from torchvts.model import Calibration
 from torchvts.stream import Overlay, TactileFrame, TactileStream
 

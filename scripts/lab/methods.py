@@ -5,6 +5,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
+from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,17 +15,22 @@ from torch import Tensor, nn
 
 from torchvts.calibration import RESPONSE_BLUR_PX, with_preprocessing
 from torchvts.compensate import Compensate
+from torchvts.core.geometry import gradient_of_depth
 from torchvts.integration import AdaptiveIntegration, PerspectiveIntegration, PoissonDST
 from torchvts.model import Calibration, ResponseModel, Sensor
 from torchvts.normals import NormalFromIntensity, NormalFromLookup, NormalFromMLP
 from torchvts.pipeline import DepthOutput, DepthPipeline, Shadows
 from torchvts.scenes import render, sphere_press
+from torchvts.skin import ContactFromDepth
 from torchvts.training.presses import Training, quiet_calibrate, train_network, training_pixels
 
 from .peers import GsSdkPipeline, PoissonSciPy, as_output
 
 GIVEN_NETWORK = "given network"
 """Name of a network that was trained before."""
+
+LEAST_DEFORMED_MM = 0.02
+"""Skin of anyone's depth counts as deformed above this: depth of the sensors is good to some hundredths of a mm."""
 
 Reconstruct = Callable[[Tensor], DepthOutput]
 """Images (B, 3, H, W) to depth."""
@@ -240,6 +246,52 @@ def shipped_prior(training: Training, sensor: Sensor) -> Built:
 def with_network(path: Path) -> Method:
     """The method of a network that was trained before on the unit, perhaps on the very presses."""
     return Method(GIVEN_NETWORK, from_presses=partial(given_network, path=path), ours=False, learns=False, seen=True)
+
+
+def own_methods(normals: str | None, depth: str | None) -> tuple[Method, ...]:
+    """The methods of anyone's networks, each named as ``module:factory`` and made by ``factory(training)`` for every unit.
+
+    Args:
+        normals: gives an ``nn.Module`` of compensated images (B, 3, H, W) to unit normals, which takes the place of the calibrated
+            model in mode fast.
+        depth: gives a callable of images (B, 3, H, W) in [0, 1] to depth (B, 1, H, W), mm; contact is found in it, as in all depth.
+    Raises:
+        ValueError: a text of another form, or a module without this factory.
+        ImportError: no such module.
+    """
+    given = ((normals, _by_own_normals), (depth, _by_own_depth))
+    return tuple(
+        Method(name, from_presses=partial(build, factory=_factory(name)), ours=False) for name, build in given if name is not None
+    )
+
+
+def _factory(name: str) -> Callable[[Training], Any]:
+    module, _, function = name.partition(":")
+    if not module or not function:
+        raise ValueError(f"expected module:factory, as in my_networks:normals, got {name!r}")
+    found: Callable[[Training], Any] | None = getattr(import_module(module), function, None)
+    if not callable(found):
+        raise ValueError(f"{name}: expected a function {function} in {module}, got {type(found).__name__}")
+    return found
+
+
+def _by_own_normals(training: Training, factory: Callable[[Training], nn.Module]) -> Built:
+    block = factory(training)
+    built = DepthPipeline.from_calibration(training.calibration, normals=block).requires_grad_(False)
+    return Built(built, sum(p.numel() for p in block.parameters()), used=len(training.located) if training.presses else 0)
+
+
+def _by_own_depth(training: Training, factory: Callable[[Training], Callable[[Tensor], Tensor]]) -> Built:
+    reconstruct, pitch = factory(training), training.sensor.mm_per_pixel
+    find = ContactFromDepth(pitch)
+
+    def output(image: Tensor) -> DepthOutput:
+        depth_mm = reconstruct(image)
+        deformed = depth_mm > LEAST_DEFORMED_MM
+        return as_output(depth_mm, gradient_of_depth(depth_mm, pitch), find(depth_mm, deformed))
+
+    count = sum(p.numel() for p in reconstruct.parameters()) if isinstance(reconstruct, nn.Module) else 0
+    return Built(output, count, used=len(training.presses))
 
 
 def _as_gs_sdk(module: NormalFromMLP, training: Training, note: str) -> Built:

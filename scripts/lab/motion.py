@@ -14,8 +14,7 @@ from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 
 from torchvts import viz
-from torchvts.core.files import IMAGE_SUFFIXES, read_image
-from torchvts.core.recordings import natural_order
+from torchvts.core.files import IMAGE_SUFFIXES, natural_order, read_image
 from torchvts.model.markers import FillMarkers, find_dots
 from torchvts.scenes import DottedSkin, Drag
 from torchvts.skin import DotMotion, SkinMotion

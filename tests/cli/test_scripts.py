@@ -1,5 +1,7 @@
 """The scripts do their job from the command line, and refuse bad input in a sentence."""
 
+import re
+
 import pytest
 import torch
 
@@ -60,3 +62,10 @@ def test_reproduce_paper_prints_its_figures_beside_the_papers(run_script, tmp_pa
     assert done.returncode == 0, done.stderr
     assert len(list(tmp_path.glob("table_3*.png"))) == 3
     assert "| paper, three targets | 0.64, 2.35, 2.59 | below 1 | 6 to 8 |" in done.stdout
+
+
+def test_demo_draws_a_film_and_says_how_far_depth_is_off(run_script, tmp_path):
+    done = run_script("demo", "--out", tmp_path, "--frames", 2)
+    assert done.returncode == 0, done.stderr
+    assert float(re.search(r"off by (\d+) um RMS", done.stdout).group(1)) < 40
+    assert {path.name for path in tmp_path.iterdir()} == {"film.webp", "press.png"}

@@ -351,3 +351,16 @@ def test_the_command_cuts_raw_frames_as_reconstruct_does(tmp_path, run_script):
 def test_the_smallest_sensors_are_diagnosed(ring, size):
     unit = vts.Calibration.from_lights(ring(), vts.Sensor("small", *size, 0.5))
     assert vts.diagnose(None, unit.model_image.detach(), unit).ok
+
+
+@pytest.mark.filterwarnings("ignore::torchvts.CalibrationWarning")
+def test_a_raw_frame_of_the_sensors_size_shows_more_than_the_cropped_background(data):
+    """It was called another unit's."""
+    images = torch.stack([vts.read_image(file) for file in sorted((data / "gelsight_mini_c").glob("frame_*.jpg"))[::5]])
+    assert images.shape[2:] == (240, 320)
+    sensor = dataclasses.replace(vts.Sensor.load("gelsight_mini"), roi_px=(46, 34, 228, 172), raw_size_px=())
+    background = sensor.rectify(images).median(0).values
+    unit = vts.calibrate(background, dataclasses.replace(sensor, roi_px=None))
+    assert [finding.name for finding in vts.diagnose(None, sensor.rectify(images)[0], unit) if finding.severity != "note"] == []
+    found = list(vts.diagnose(None, images[0], unit))
+    assert found[0].name == "other_view" and "shows more than the background, by 14% of each side" in str(found[0])

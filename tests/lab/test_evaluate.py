@@ -157,6 +157,36 @@ def test_evaluate_with_a_trained_network(run_script, folder, tmp_path):
     assert result.rows[0].errors["normal_deg"] < 3.0 and result.rows[1].frames == 4
 
 
+OWN = """
+import torch
+from torchvts import NormalFromResponse, DepthPipeline
+
+def normals(training):
+    return NormalFromResponse.from_calibration(training.calibration)
+
+def depth(training):
+    pipe = DepthPipeline.from_calibration(training.calibration)
+    return lambda images: pipe(images).depth_mm
+"""
+
+
+def test_networks_of_ones_own_are_scored_beside_the_methods(run_script, monkeypatch, folder, tmp_path):
+    """The calibrated model itself, given as one's own, has its scores."""
+    (tmp_path / "own_networks.py").write_text(OWN)
+    monkeypatch.syspath_prepend(tmp_path)
+    options = ("--normals", "own_networks:normals", "--depth", "own_networks:depth", "--methods", "fast", "--folds", 2)
+    done = run_script("accuracy", folder, "--sensor", folder / "rig.yaml", "--out", tmp_path, *options)
+    assert done.returncode == 0, done.stderr
+    found = {row["method"]: row for row in json.loads((tmp_path / "scores.json").read_text())["rows"]}
+    assert list(found) == ["fast", "own_networks:normals", "own_networks:depth"]
+    for name in ("depth_normal_deg", "relief_um"):
+        same = [found[method]["errors"][name] for method in found]
+        assert same == pytest.approx([same[0]] * 3, rel=0.05), (name, [row["note"] for row in found.values()])
+    assert found["own_networks:normals"]["errors"]["used"] == 6
+    for text, message in (("own_networks", "expected module:factory"), ("own_networks:other", "expected a function other in")):
+        assert message in run_script("accuracy", folder, "--normals", text).stderr
+
+
 class FailingUnit:
     """A calibration that cannot be made."""
 

@@ -248,15 +248,24 @@ def test_depth_in_a_corner_behind_a_lens():
         ({"corners_px": ((0, 0), (300, 0), (300, 210), (0, 210))}, (120, 160), "frame: 120 x 160 does not contain corners_px"),
         (
             {},
-            (48, 64),
-            "frame: expected 24 x 32 for sensor 'rig', got 48 x 64: resize it, load the sensor with height=48, width=64, "
-            "or give it roi_px: .0, 0, 64, 48.",
+            (36, 48),
+            "frame: expected 24 x 32 for sensor 'rig', got 36 x 48: resize it, load the sensor with height=36, width=48, "
+            "or give it roi_px: .0, 0, 48, 36.",
         ),
     ],
 )
 def test_a_frame_that_does_not_fit_is_refused(options, size, message):
     with pytest.raises(ValueError, match=message):
         vts.Sensor(**GOOD, **options).rectify(torch.zeros(1, 3, *size))
+
+
+def test_a_frame_of_twice_the_resolution_is_scaled_with_a_sentence():
+    raw = torch.rand(1, 3, 48, 64)
+    with pytest.warns(UserWarning, match=r"48 x 64, 2 times the resolution of sensor 'rig', is scaled.*raw_size_px: \[\[48, 64"):
+        image = vts.Sensor(**GOOD).rectify(raw)
+    assert torch.equal(image, vts.Sensor(**GOOD, raw_size_px=((48, 64),)).rectify(raw))
+    with pytest.raises(ValueError, match="got 48 x 64"):
+        vts.Sensor(**GOOD, mirror=True).rectify(raw)
 
 
 def test_the_wedge_video_is_rectified_to_its_gel(data):
@@ -369,3 +378,36 @@ def test_a_recording_of_a_digit_reads_the_same_upright_and_lying(data, tmp_path)
 def test_a_mount_in_metres_is_asked_about():
     with pytest.warns(UserWarning, match="sensor_to_robot: its shift is at most 0.12 mm: was it meant in m?"):
         vts.Sensor(**GOOD, sensor_to_robot=((0, 0, 1, 0.05), (0, 1, 0, 0), (-1, 0, 0, 0.12), (0, 0, 0, 1)))
+
+
+@pytest.mark.parametrize("options", [{}, {"roi_px": [10, 20, 160, 120]}, {"turn_deg": 90}, {"raw_size_px": [[240, 320]]}])
+def test_pixels_that_are_not_square_are_made_so(options):
+    """A plane of colours in mm keeps its slope along both axes."""
+    values = {"name": "rig", "height": 120, "width": 160, "mm_per_pixel": [0.1, 0.12], **options}
+    sensor = vts.Sensor.from_dict(values, "rig.yaml")
+    assert (sensor.mm_per_pixel, sensor.height, sensor.width) == (0.12, 120, 133)
+    assert vts.Sensor.from_dict(sensor.to_dict(), "again") == sensor
+    rows, columns = {"turn_deg": (160, 120), "raw_size_px": (240, 320)}.get(next(iter(options), ""), (200, 240))
+    rows, columns = (rows, columns) if options else (120, 160)
+    y, x = torch.meshgrid(torch.arange(rows, dtype=torch.float64), torch.arange(columns, dtype=torch.float64), indexing="ij")
+    if "turn_deg" in options:
+        x, y = y, columns - 1 - x  # as seen after the turn
+    scale = 1.0 if "raw_size_px" not in options else 159 / 319
+    raw = torch.stack((0.1 * scale * x, 0.12 * scale * y, 0 * x))[None] / 40
+    image = sensor.rectify(raw)[0] * 40
+    slopes = [float((image[0, 60, 130] - image[0, 60, 2]) / 128), float((image[1, 110, 60] - image[1, 10, 60]) / 100)]
+    assert slopes == pytest.approx([0.12, 0.12], rel=5e-3)
+    assert image.shape == (3, 120, 133)
+
+
+@pytest.mark.parametrize(
+    "options, message",
+    [
+        ({"mm_per_pixel": [0.1, 0.2]}, r"rig\.yaml: mm_per_pixel: expected a pitch, or .along x, along y. within 1\.5, got"),
+        ({"mm_per_pixel": [0.1]}, "mm_per_pixel: expected"),
+        ({"raw_crop": 0.1}, r"mm_per_pixel: expected one pitch beside raw_crop, got .*: give roi_px, or one pitch"),
+    ],
+)
+def test_pitches_that_cannot_be_are_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        vts.Sensor.from_dict({**GOOD, "mm_per_pixel": [0.1, 0.11], **options}, "rig.yaml")

@@ -556,3 +556,9 @@ def test_a_dimmed_led_costs_nothing_on_rigs_that_saturate(height_mm, out_mm, alb
         errors.append(metrics.depth_error(out.depth_mm, scene.depth_mm, 0.25))
     assert errors[1].rms_px < 1.3 * errors[0].rms_px
     assert errors[1].max_px < 1.3 * errors[0].max_px
+
+
+def test_vmap_is_refused_with_a_sentence(ring):
+    pipe = pipeline(ring(), vts.Sensor("rig", 48, 64, 0.5), "fast")
+    with pytest.raises(RuntimeError, match=r"images: expected a batch of frames, got a frame of torch\.func\.vmap: call it on the"):
+        torch.func.vmap(lambda image: pipe(image[None]).depth_mm[0])(torch.rand(2, 3, 48, 64))

@@ -30,7 +30,8 @@ def add_sensor(parser: argparse._ActionsContainer, text: str = "") -> None:
 
 def add_unit(parser: argparse._ActionsContainer, inputs: str, required: bool = True) -> None:
     """The files of a command that reads frames: a calibration, then ``inputs``; or inputs alone, and ``--sensor`` calibrates."""
-    parser.add_argument("files", nargs="+" if required else "*", metavar="FILE", help=f"calibration, then {inputs}; with --sensor only these")
+    count, what = "+" if required else "*", f"calibration, then {inputs}; with --sensor only these"
+    parser.add_argument("files", nargs=count, metavar="FILE", help=what)
     add_sensor(parser, "calibrate first: ")
     parser.add_argument("--background", type=Path, nargs="+", metavar="IMAGE", help="to calibrate: without contact; or a video")
     add_press(parser)

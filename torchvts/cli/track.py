@@ -26,8 +26,7 @@ import torch
 from torch import Tensor
 
 from ..core.checks import check_positive
-from ..core.files import check_folder, make_folder, read_image, write_atomically
-from ..core.recordings import Pixels
+from ..core.files import Pixels, check_folder, make_folder, read_image, write_atomically
 from ..model.summary import NOT_METRIC
 from ..pose import OutputFrame, PoseTracker, TrackedPose
 from ..pose.follow import TRUSTED_DEG, TRUSTED_MM

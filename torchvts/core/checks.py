@@ -309,10 +309,17 @@ def in_range(low: float, high: float) -> bool:
 
 
 def check_range(name: str, image: Tensor) -> None:
-    """Raise unless every value is finite and in [0, 1]. Reads values."""
+    """Raise unless every value is finite and in [0, 1]. Reads values, which :func:`torch.func.vmap` does not let."""
     if image.numel() == 0:
         return
-    low, high = (float(v) for v in torch.aminmax(image.detach()))
+    try:
+        low, high = (float(v) for v in torch.aminmax(image.detach()))
+    except RuntimeError as error:
+        if "vmap" in str(error):
+            raise RuntimeError(
+                f"{name}: expected a batch of frames, got a frame of torch.func.vmap: call it on the batch"
+            ) from error
+        raise
     if not (math.isfinite(low) and math.isfinite(high)):
         count = int((~torch.isfinite(image)).sum())
         raise ValueError(f"{name}: expected finite values, got {count} NaN or infinite: a camera or an upstream division failed")

@@ -4,10 +4,12 @@ import errno
 import hashlib
 import json
 import os
+import re
 import secrets
 import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
+from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
@@ -19,12 +21,29 @@ from torch import Tensor
 
 from .checks import MOST_PIXELS, check_field, check_path
 
+Pixels = np.ndarray[Any, Any]
+"""OpenCV's image, (H, W, 3) B, G, R, uint8 or uint16."""
+
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 PAGED_SUFFIXES = (".tif", ".tiff")
 VIDEO_SUFFIXES = (".avi", ".mp4", ".mov", ".mkv", ".webm")
 
+REMEDIES = {
+    ".db3": "name the folder of the bag, which has its metadata.yaml",
+    ".parquet": "name the folder of the LeRobot data set",
+    ".npz": "name one array: numpy.save(name, images), (T, H, W, 3), R, G, B",
+    ".pkl": "it can run any program when it is opened: save its images by numpy.save, (T, H, W, 3), R, G, B",
+    ".gz": "unpack it first",
+    ".tgz": "unpack it first",
+    ".rrd": "rerun keeps it for showing: give the camera's recording",
+}
+"""What helps with files that are not read, by suffix."""
+
 IN_COLOUR = 6
 """OpenCV's IMREAD_ANYDEPTH | IMREAD_ANYCOLOR: grey stays grey, 16 bits stay 16, and an image that its EXIF tag turns is turned."""
+
+MOST_OF_12_BITS = 4095
+"""An image of 16 bits whose values stay below this is black, or of 12 bits."""
 
 MOST_BYTES = 2**29
 """A larger image file is not read."""
@@ -148,6 +167,17 @@ def write_atomically(path: str | Path) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
+def natural_order(name: str) -> tuple[list[str | Decimal], str]:
+    """Key that sorts names with their numbers as numbers, decimals of times too.
+
+    Example:
+        >>> sorted(["10.png", "2.png", "1.25.png", "1.5.png"], key=natural_order)
+        ['1.25.png', '1.5.png', '2.png', '10.png']
+    """
+    parts = re.split(r"([0-9]+(?:\.[0-9]+)?)", name)
+    return [Decimal(part) if k % 2 else part for k, part in enumerate(parts)], name
+
+
 def image_path(path: str | Path) -> Path:
     """The path of a file to read, or FileNotFoundError."""
     path = check_path("path", path)
@@ -168,7 +198,7 @@ def read_image(path: str | Path) -> Tensor:
     return rgb_from_bgr(read_pixels(path))
 
 
-def read_pixels(path: str | Path) -> np.ndarray[Any, Any]:
+def read_pixels(path: str | Path) -> Pixels:
     """Read an image file as OpenCV gives it, (H, W, 3) B, G, R, 8 or 16 bits; raises as :func:`read_image`."""
     path = image_path(path)
     if path.suffix.lower() in VIDEO_SUFFIXES:
@@ -176,6 +206,8 @@ def read_pixels(path: str | Path) -> np.ndarray[Any, Any]:
             f"{path}: expected an image, got a video: torchvts.stream.read_background([path], sensor) makes a background of its "
             "first frames, torchvts reconstruct takes all of them"
         )
+    if path.suffix.lower() in REMEDIES:
+        raise ValueError(f"{path}: expected an image or a recording: {REMEDIES[path.suffix.lower()]}")
     _check_still(path)
     return check_colour(decode_image(path, IN_COLOUR), path)
 
@@ -184,9 +216,12 @@ def _check_still(path: Path) -> None:
     """Refuse a file of several frames, of which only the first would be read."""
     with path.open("rb") as stream:
         head = stream.read(64)
-    remedy = "save its frames as PNG, as a TIFF of several pages or as a video without loss"
-    if head[:4] == b"GIF8":
-        raise ValueError(f"{path}: expected an image of 8 bits a channel, got a GIF, which keeps 256 colours: {remedy}")
+    remedy = "save frames as PNG in true colour, as a TIFF of several pages or as a video without loss"
+    indexed = {"a GIF": head[:4] == b"GIF8", "a PNG with a palette": head[12:16] == b"IHDR" and head[25] == 3}
+    indexed["a BMP with a palette"] = head[:2] == b"BM" and 0 < int.from_bytes(head[28:30], "little") <= 8
+    for kind, is_it in indexed.items():
+        if is_it:
+            raise ValueError(f"{path}: expected an image of 8 bits a channel, got {kind}, which keeps 256 colours: {remedy}")
     if (head[8:16] == b"WEBPVP8X" and head[20] & 2) or b"acTL" in head:
         raise ValueError(f"{path}: expected one image, got an animation: {remedy}")
     if (count := count_pages(path)) > 1:
@@ -220,22 +255,44 @@ def count_pages(path: Path) -> int:
     return max(1, len(found))
 
 
-def check_colour(pixels: np.ndarray[Any, Any] | None, path: Path) -> np.ndarray[Any, Any]:
+def check_colour(pixels: Pixels | None, path: Path) -> Pixels:
     """The colours of a decoded image (H, W, 3 or 4), B, G, R.
 
     Raises:
-        ValueError: it could not be decoded, has other channels, or not 8 or 16 bits.
+        ValueError: it could not be decoded, has other channels, or its values are not what :func:`whole_levels` takes.
     """
     if pixels is None:
         raise ValueError(f"{path}: not an image, or cut short")
     if pixels.ndim != 3 or pixels.shape[2] not in (3, 4):
         raise ValueError(f"{path}: expected a colour image, got one of shape {pixels.shape}: three lights need three channels")
+    return whole_levels(pixels[:, :, :3], path)
+
+
+def whole_levels(pixels: np.ndarray[Any, Any], path: Path) -> Pixels:
+    """The values of an image in 8 or 16 bits; floats in [0, 1] or [0, 255] become 8 bits where these are exact, else 16.
+
+    Raises:
+        ValueError: other values; or 16 bits so dark that only 8, 10 or 12 of them seem used, whose scale cannot be known.
+    """
+    most = int(pixels.max(initial=0)) if pixels.dtype == np.uint16 else MOST_OF_12_BITS + 1
+    if most <= MOST_OF_12_BITS:
+        raise ValueError(
+            f"{path}: expected 16 bits that reach beyond {MOST_OF_12_BITS}, got at most {most}: 8, 10 or 12 bits stored in 16? "
+            "multiply them by 257, 64 or 16; or it is black"
+        )
+    if pixels.dtype.kind == "f":
+        low, high = float(pixels.min(initial=np.inf)), float(pixels.max(initial=0.0))
+        if not 0.0 <= low <= high <= 255.0:  # nor where one is no number
+            raise ValueError(f"{path}: expected values in [0, 1] or [0, 255], got {low:.4g} to {high:.4g}: scale them before")
+        levels = pixels.astype(np.float64) * (255.0 if high <= 1.0 else 1.0)
+        whole = np.rint(levels)
+        return whole.astype(np.uint8) if np.abs(levels - whole).max() < 1e-3 else np.rint(257.0 * levels).astype(np.uint16)
     if pixels.dtype not in (np.uint8, np.uint16):
         raise ValueError(f"{path}: expected 8 or 16 bits per channel, got {pixels.dtype}")
-    return pixels[:, :, :3]
+    return pixels
 
 
-def decode_image(path: Path, flags: int) -> np.ndarray[Any, Any] | None:
+def decode_image(path: Path, flags: int) -> Pixels | None:
     """An image file as OpenCV decodes it; None if it does not.
 
     Raises:
@@ -248,7 +305,7 @@ def decode_image(path: Path, flags: int) -> np.ndarray[Any, Any] | None:
     return decode_bytes(np.fromfile(path, dtype=np.uint8), flags, str(path)) if size else None
 
 
-def decode_bytes(data: np.ndarray[Any, Any], flags: int, source: str) -> np.ndarray[Any, Any] | None:
+def decode_bytes(data: np.ndarray[Any, Any], flags: int, source: str) -> Pixels | None:
     """:func:`decode_image` for bytes (N,) in memory; ``source`` names them in errors."""
     import cv2
 
@@ -300,7 +357,7 @@ def check_pixels(name: str, pixels: object) -> None:
         raise ValueError(f"{name}: expected (H, W, 3), B, G, R, got {pixels.shape}: not in colour?")
 
 
-def rgb_from_bgr(pixels: np.ndarray[Any, Any]) -> Tensor:
+def rgb_from_bgr(pixels: Pixels) -> Tensor:
     """OpenCV's (H, W, 3) B, G, R integers of 8 or 16 bits as (3, H, W) float32 in [0, 1], R, G, B.
 
     Raises:
@@ -386,7 +443,7 @@ def read_depth_png(path: str | Path) -> Tensor:
     return (torch.from_numpy(pixels.astype(np.float32)) - DEPTH_PNG_ZERO)[None, None] * DEPTH_PNG_STEP_MM
 
 
-def write_pixels(path: Path, pixels: np.ndarray[Any, Any]) -> None:
+def write_pixels(path: Path, pixels: Pixels) -> None:
     """Write what :func:`read_pixels` reads, or one channel, (H, W)."""
     import cv2
 

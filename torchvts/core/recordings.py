@@ -1,31 +1,27 @@
-"""Reads recordings: an image, a TIFF of several pages, a folder of images, a video; a frame is decoded when it is asked for."""
+"""Reads recordings: images, folders of them, TIFFs of several pages, videos, containers; frames are decoded when asked for."""
 
-import re
-from collections.abc import Callable, Iterator
-from decimal import Decimal
+from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
+from .containers import find_container, open_film
 from .files import (
     IMAGE_SUFFIXES,
     IN_COLOUR,
     VIDEO_SUFFIXES,
+    Pixels,
     check_colour,
-    check_text_name,
     count_pages,
+    natural_order,
     read_pixels,
 )
-
-Pixels = np.ndarray[Any, Any]
+from .videos import ASSUMED_FPS, frames_a_second, lossy_codec, open_video, video_reads
 
 PAGES = 16
 """Pages of a TIFF that are decoded at once."""
-
-ASSUMED_FPS = 30.0
-"""Frames a second of images that say nothing of their times."""
 
 
 class RawFrame(NamedTuple):
@@ -42,13 +38,16 @@ class RawFrame(NamedTuple):
 
 
 def raw_frames(source: str | Path) -> Iterator[RawFrame]:
-    """The frames of an image, a TIFF of several pages, a folder of images (1, 2, 10) or a video, in order.
+    """The frames of an image, a TIFF of several pages, a folder of images (1, 2, 10), a video or a container, in order.
 
     Raises:
         FileNotFoundError: no such file or folder.
+        ImportError: the library of a container is not installed.
         ValueError: a folder without images; while frames are asked for: a video that gives none.
     """
     path = Path(source)
+    if (film := open_film(path)) is not None:
+        return _numbered(path, film.reads())
     if path.is_dir():
         files = image_files(path)
         if not files:
@@ -62,32 +61,17 @@ def raw_frames(source: str | Path) -> Iterator[RawFrame]:
 
 def _of_file(path: Path) -> Iterator[RawFrame]:
     if path.suffix.lower() in VIDEO_SUFFIXES:
-        return _of_video(path)
+        return _numbered(path, video_reads(path))
     if (count := count_pages(path)) > 1:
-        return _of_pages(path, count)
+        return _numbered(path, _of_pages(path, count))
     return iter([RawFrame(path.stem, lambda: read_pixels(path))])
 
 
-def _of_video(path: Path) -> Iterator[RawFrame]:
-    capture, number = open_video(path), 0
-
-    def read() -> Pixels:
-        there, pixels = capture.retrieve()
-        if not there:
-            raise ValueError(f"{path}: frame {number} cannot be decoded")
-        return pixels  # type: ignore[no-any-return]
-
-    try:
-        while capture.grab():
-            yield RawFrame(f"{path.stem}_{number:06d}", read)
-            number += 1
-    finally:
-        capture.release()
-    if number == 0:
-        raise ValueError(f"{path}: not a video, or cut short: no frame could be read")
+def _numbered(path: Path, reads: Iterable[Callable[[], Pixels]]) -> Iterator[RawFrame]:
+    return (RawFrame(f"{path.stem}_{number:06d}", read) for number, read in enumerate(reads))
 
 
-def _of_pages(path: Path, count: int) -> Iterator[RawFrame]:
+def _of_pages(path: Path, count: int) -> Iterator[Callable[[], Pixels]]:
     import cv2
 
     data = np.fromfile(path, np.uint8)
@@ -97,23 +81,12 @@ def _of_pages(path: Path, count: int) -> Iterator[RawFrame]:
             pages = list(cv2.imdecodemulti(data, IN_COLOUR, range=(number, min(number + PAGES, count)))[1])
         if number % PAGES >= len(pages):
             return  # cut short
-        yield RawFrame(f"{path.stem}_{number:06d}", partial(check_colour, pages[number % PAGES], path))
+        yield partial(check_colour, pages[number % PAGES], path)
 
 
 def is_film(path: Path) -> bool:
-    """Whether a file has frames with numbers: a video, or a TIFF of several pages."""
-    return path.suffix.lower() in VIDEO_SUFFIXES or count_pages(path) > 1
-
-
-def natural_order(name: str) -> tuple[list[str | Decimal], str]:
-    """Key that sorts names with their numbers as numbers, decimals of times too.
-
-    Example:
-        >>> sorted(["10.png", "2.png", "1.25.png", "1.5.png"], key=natural_order)
-        ['1.25.png', '1.5.png', '2.png', '10.png']
-    """
-    parts = re.split(r"([0-9]+(?:\.[0-9]+)?)", name)
-    return [Decimal(part) if k % 2 else part for k, part in enumerate(parts)], name
+    """Whether a path names frames with numbers: a video, a TIFF of several pages, or a recording in a container."""
+    return path.suffix.lower() in VIDEO_SUFFIXES or count_pages(path) > 1 or find_container(path) is not None
 
 
 def image_files(folder: Path) -> list[Path]:
@@ -127,6 +100,8 @@ def count_frames(source: str | Path) -> int:
     import cv2
 
     path = Path(source)
+    if (film := open_film(path)) is not None:
+        return film.length
     if path.is_dir():
         return sum(count_frames(file) for file in image_files(path))
     if path.suffix.lower() in VIDEO_SUFFIXES:
@@ -147,25 +122,6 @@ def cut_short(path: Path, count: int) -> str:
     return f"cut short? it announces {announced} frames, {count} could be read" if count < least else ""
 
 
-def open_video(path: Path) -> Any:
-    """OpenCV's capture of a video file, which may not be opened.
-
-    Raises:
-        ValueError: the name is not UTF-8.
-    """
-    import cv2
-
-    return cv2.VideoCapture(check_text_name("video", path))
-
-
-def frames_a_second(capture: Any) -> float:
-    """Rate of an OpenCV capture; :data:`ASSUMED_FPS` where it does not know."""
-    import cv2
-
-    fps = float(capture.get(cv2.CAP_PROP_FPS))
-    return fps if 0.5 <= fps <= 1000.0 else ASSUMED_FPS
-
-
 def video_rate(path: Path) -> float:
     """:func:`frames_a_second` of a video file; :data:`ASSUMED_FPS` of others."""
     if path.is_dir() or path.suffix.lower() not in VIDEO_SUFFIXES:
@@ -175,25 +131,6 @@ def video_rate(path: Path) -> float:
         return frames_a_second(capture)
     finally:
         capture.release()
-
-
-CODECS = {
-    **dict.fromkeys(("FMP4", "mp4v", "XVID", "DIVX", "DX50", "MP42", "MP43"), "MPEG-4"),
-    **dict.fromkeys(("h264", "H264", "avc1", "X264"), "H.264"),
-    **dict.fromkeys(("hevc", "HEVC", "hvc1", "hev1"), "H.265"),
-    **dict.fromkeys(("MJPG", "mjpg"), "Motion JPEG"),
-    **dict.fromkeys(("FFV1", "HFYU", "FFVH", "MPNG", "png ", "I420", "YUY2", "YUYV", "\0\0\0\0"), ""),
-}
-"""OpenCV's codes of codecs, and the names of those that lose something; others are shown by their code."""
-
-
-def lossy_codec(capture: Any) -> str:
-    """Name of the codec of an OpenCV capture; empty where it loses nothing, or is not known."""
-    import cv2
-
-    code = int(capture.get(cv2.CAP_PROP_FOURCC))
-    letters = max(code, 0).to_bytes(8, "little")[:4].decode("latin-1")
-    return CODECS.get(letters, letters)
 
 
 def video_codec(path: Path) -> str:

@@ -8,8 +8,9 @@ from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
 
-from ..core.files import IMAGE_SUFFIXES, PAGED_SUFFIXES, VIDEO_SUFFIXES
-from ..core.recordings import count_frames, is_film, natural_order
+from ..core.containers import find_container
+from ..core.files import IMAGE_SUFFIXES, PAGED_SUFFIXES, VIDEO_SUFFIXES, natural_order
+from ..core.recordings import count_frames, is_film
 
 STATE = ".torchvts"
 """Folder inside the results that holds the settings and one record per frame; a folder that has one is never read as a source."""
@@ -33,7 +34,7 @@ class Item(NamedTuple):
         stem: path of its results inside the output folder, without suffix.
         mark: size in bytes and time of modification in ns; another mark means another file.
         file: the file itself.
-        is_film: whether it has frames with numbers: a video, or a TIFF of several pages.
+        is_film: whether it has frames with numbers: a video, a TIFF of several pages, or a recording in a container.
     """
 
     path: str
@@ -53,7 +54,7 @@ class Item(NamedTuple):
 
 
 Source = Path | tuple[Path, ...]
-"""An image, a video, a folder with all below it; or several of them."""
+"""An image, a video, a recording in a container, a folder with all below it; or several of them."""
 
 
 def one_line(text: str) -> str:
@@ -96,18 +97,24 @@ def list_items(source: str | Source, every: int = 1) -> Iterator[Item]:
 def _list(source: str | Source) -> Iterator[Item]:
     if isinstance(source, tuple):
         yield from _several(source)
-    elif Path(source).is_dir():
+    elif is_folder(Path(source)):
         yield from _walk(Path(source), "")
     else:
         yield _item(Path(source), "", Path(source).stem)
 
 
 def _item(file: Path, prefix: str, stem: str) -> Item:
+    container = find_container(file)
     try:
-        status = file.stat()
+        status = (file if container is None else container[1]).stat()
     except OSError:  # a link that leads nowhere, or to itself: said when it is read
         status = file.lstat()
     return Item(prefix + file.name, prefix + stem, (status.st_size, status.st_mtime_ns), file, is_film(file))
+
+
+def is_folder(path: Path) -> bool:
+    """Whether a path is a folder whose files are listed, not a container that is one."""
+    return path.is_dir() and find_container(path) is None
 
 
 def _several(source: tuple[Path, ...]) -> Iterator[Item]:
@@ -118,12 +125,12 @@ def _several(source: tuple[Path, ...]) -> Iterator[Item]:
     groups: dict[Path, list[str]] = {}
     for folder, path in places:
         groups.setdefault(folder, []).append(path.name)
-    stems = {folder: output_stems([name for name in names if not (folder / name).is_dir()]) for folder, names in groups.items()}
+    stems = {folder: output_stems([name for name in names if not is_folder(folder / name)]) for folder, names in groups.items()}
     seen: set[str] = set()
     for folder, path in places:
         prefix = "" if folder == root else f"{folder.relative_to(root).as_posix()}/"
         within = f"{prefix}{path.name}/" if path.name else ""
-        found = _walk(path, within) if path.is_dir() else [_item(path, prefix, stems[folder][path.name])]
+        found = _walk(path, within) if is_folder(path) else [_item(path, prefix, stems[folder][path.name])]
         for item in found:
             if item.path not in seen:
                 seen.add(item.path)

@@ -11,8 +11,8 @@ from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
 from ..core.arrays import Array
 from ..core.checks import in_one_line
-from ..core.files import read_pixels, rgb_from_bgr
-from ..core.recordings import Pixels, raw_frames
+from ..core.files import Pixels, read_pixels, rgb_from_bgr
+from ..core.recordings import raw_frames
 from ..model import Sensor
 from .items import Item, list_items
 from .records import Records

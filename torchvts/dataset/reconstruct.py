@@ -18,6 +18,7 @@ import torch
 
 from ..core import __version__
 from ..core.checks import check_choice, check_integer, check_path, check_sequence
+from ..core.containers import open_film
 from ..core.files import IMAGE_SUFFIXES, VIDEO_SUFFIXES
 from ..model import Calibration
 from ..pipeline import MODES, unit_pipeline
@@ -63,8 +64,8 @@ def reconstruct_dataset(
 
     Args:
         calibration: file of a calibrated unit.
-        source: image, video, or folder with all below it, or several of these; hidden files, links to folders and results of runs
-            are passed over.
+        source: image, video, recording in a container, or folder with all below it, or several of these; hidden files, links to
+            folders and results of runs are passed over. Containers are named, not looked for in folders.
         out: folder for results, made if missing.
         mode: "fast" or "precise".
         format: "npz" (depth, normals, gradient, masks, units; :func:`torchvts.read_result`), "video-npz" (the same, one file a
@@ -84,6 +85,7 @@ def reconstruct_dataset(
         strict: stop at the first frame that cannot be used.
     Raises:
         FileNotFoundError: no calibration or source.
+        ImportError: the library of a container is not installed.
         ValueError: nothing to do in the source, an option that does not exist, or ``out`` was begun with other settings.
         RuntimeError: another process failed, or another run writes there.
     """
@@ -148,6 +150,8 @@ def _digest(path: str | Path | None) -> str:
 
 def _check_source(source: Source, out: Path) -> None:
     for path in source if isinstance(source, tuple) else (source,):
+        if open_film(path) is not None:
+            continue
         if not path.exists():
             raise FileNotFoundError(f"{path}: no such file or folder")
         if path.is_dir() and out.resolve() == path.resolve():

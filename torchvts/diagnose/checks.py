@@ -33,6 +33,9 @@ scatters light over all of a small sensor."""
 OTHER_DEG = 1.2
 """The same from which it is asked whether the frame is from another unit of its type: 1.4 to 5 degrees on three of one type."""
 
+OTHER_PATTERN = 0.945
+"""Unlikeness of the skin's fine pattern from which it is another's, or another part of it is seen."""
+
 BEYOND = 2.0
 """Error that the calibration states for a contact, over that for its own presses, from which it is said."""
 
@@ -240,13 +243,15 @@ def _rough(e: Examination) -> Figures:
     return {"value": e.free_deg, "read": "reads no depth" if covered else "does not know the undeformed skin"}
 
 
-def _other_unit(e: Examination) -> float | None:
-    """Unlikeness of the skin's fine pattern, where the least changed skin seems to have slopes."""
+def _other_unit(e: Examination) -> float | Finding | None:
+    """Unlikeness of the skin's fine pattern, where the least changed skin seems to have slopes; or that more than it is in view."""
     light = _change_of(e.conditions)
     alike = e.free_deg < OTHER_DEG and (light is None or light["uneven"] < UNEVEN)
     if not e.unit.measured or not e.is_fine or alike:
         return None
     likeness = pattern_likeness(e.image, e.without_markers(e.value), e.unit.noise_std, e.free)
+    if likeness is not None and 1.0 - likeness > OTHER_PATTERN and (view := e.check.other_view(e.raw[None])) is not None:
+        return Finding("other_view", f"the frame {view.text}; take both in the same way", "warning", 1.0 - likeness)
     return None if likeness is None else 1.0 - likeness
 
 
@@ -399,7 +404,7 @@ CHECKS = (
           "skin free, or recalibrate",
           "fault", above=ROUGH_FREE_DEG, last=True),
     Check("other_unit", _other_unit, "the skin has not the fine pattern that it had at calibration: another unit, or its skin was "
-          "changed; use its own calibration, or calibrate again", above=0.945),
+          "changed; use its own calibration, or calibrate again", above=OTHER_PATTERN),
     Check("light_changed", lambda e: _change_of(e.conditions), "the light of free skin is {levels} of that at calibration, "
           "uneven by {uneven:.1%}: what is smooth is divided out, gamma, saturation, ambient light or another unit are not: set "
           "the camera as at calibration, shade the sensor, or recalibrate", _by_unevenness, above=LEAST_LIGHT),

@@ -1,6 +1,7 @@
 """How the sensor's image lies in the frames of its camera: bent by a lens, turned, mirrored, cut by a region, corners or a crop."""
 
 import math
+import warnings
 from functools import lru_cache
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -49,6 +50,8 @@ class CameraView(NamedTuple):
 def is_raw(name: str, frame: Tensor, view: CameraView) -> bool:
     """Whether frames (B, 3, h, w) are raw, or the sensor's images already. Scripts.
 
+    Frames of a whole multiple of the sensor's resolution count as raw, with a warning, where nothing is cut, turned or bent.
+
     Raises:
         ValueError: they are neither; says what they may be.
     """
@@ -59,6 +62,15 @@ def is_raw(name: str, frame: Tensor, view: CameraView) -> bool:
     if view.place != "" and len(view.raw_sizes) == 0:
         return True
     if view.place != "" or rows != view.size[0] or columns != view.size[1]:
+        times = rows // view.size[0]
+        plain = view.place == "" and view.raw_crop == 0.0 and view.turn_deg == 0 and not view.mirror and not view.bent
+        if plain and times >= 2 and rows == times * view.size[0] and columns == times * view.size[1]:
+            warnings.warn(
+                f"{name}: {rows} x {columns}, {times} times the resolution of sensor '{view.name}', is scaled: if that is right, "
+                f"raw_size_px: [[{rows}, {columns}]] in the sensor file says so; if the gel is only a part, roi_px",
+                stacklevel=2,
+            )
+            return True
         raise ValueError(f"{name}: {_misfit(view, rows, columns)}")
     return False
 

@@ -355,7 +355,9 @@ class Sensor:
 
     @classmethod
     def from_dict(cls, values: Any, source: str) -> "Sensor":
-        """Make a sensor from a mapping; ``source`` names it in errors."""
+        """Make a sensor from a mapping; ``source`` names it in errors. ``mm_per_pixel`` may be [along x, along y]."""
+        if isinstance(values, dict) and isinstance(values.get("mm_per_pixel"), list):
+            values = with_square_pixels(values, source)
         return from_dict(cls, values, source)
 
     def to_dict(self) -> dict[str, Any]:
@@ -373,6 +375,41 @@ class Sensor:
         text = yaml.safe_dump(self.to_dict(), sort_keys=False, width=128, default_flow_style=None, allow_unicode=True)
         with write_atomically(path) as temporary:
             temporary.write_text("".join(f"{line}\n" for line in comment) + text, encoding="utf-8")
+
+
+def with_square_pixels(values: dict[str, Any], source: str) -> dict[str, Any]:
+    """The values of a sensor whose pixels are not square, [along x, along y], mm, as those of one whose images are resampled.
+
+    The coarser pitch stays, and ``corners_px`` are those of what was seen, so that :class:`Rectify` makes pixels square.
+
+    Raises:
+        ValueError: not two pitches within 1.5 of each other, or beside keys that say the shape already.
+    Example:
+        >>> sensor = Sensor.from_dict({"name": "rig", "height": 240, "width": 320, "mm_per_pixel": [0.1, 0.109]}, "rig.yaml")
+        >>> sensor.mm_per_pixel, sensor.height, sensor.width, sensor.raw_size_px
+        (0.109, 240, 294, ((240, 320),))
+    """
+    along = check_numbers("mm_per_pixel", values["mm_per_pixel"], (2,))
+    if min(along) <= 0.0 or max(along) > MOST_OBLIQUE * min(along):
+        raise ValueError(f"{source}: mm_per_pixel: expected a pitch, or [along x, along y] within {MOST_OBLIQUE:g}, got {along}")
+    height, width = check_image_size("height", values.get("height"), "width", values.get("width"), 8)
+    if beside := [key for key in ("corners_px", "raw_crop") if values.get(key)]:
+        raise ValueError(f"{source}: mm_per_pixel: expected one pitch beside {beside[0]}, got {along}: give roi_px, or one pitch")
+    seen = (width, height) if values.get("turn_deg", 0) % 180 == 0 else (height, width)
+    raw = values.get("raw_size_px") or [[seen[1], seen[0]]]
+    across, down = raw[0][::-1] if values.get("turn_deg", 0) % 180 == 0 else raw[0]
+    left, top, across, down = values.get("roi_px") or (0, 0, across, down)
+    right, bottom = left + across - 1, top + down - 1
+    pitch = max(along)
+    changes = {
+        "mm_per_pixel": pitch,
+        "width": round((width - 1) * along[0] / pitch) + 1,
+        "height": round((height - 1) * along[1] / pitch) + 1,
+        "corners_px": [[left, top], [right, top], [right, bottom], [left, bottom]],
+    }
+    if not values.get("roi_px"):
+        changes["raw_size_px"] = raw
+    return {**{key: value for key, value in values.items() if key != "roi_px"}, **changes}
 
 
 def check_sensor(name: str, value: object) -> None:

@@ -5,8 +5,8 @@ import warnings
 from typing import NamedTuple
 
 from ..core.checks import check_integer, check_positive
-from ..core.files import check_text_name
-from ..core.recordings import Pixels, frames_a_second, lossy_codec
+from ..core.files import Pixels, check_text_name
+from ..core.videos import frames_a_second, lossy_codec
 from .devices import found_cameras
 
 

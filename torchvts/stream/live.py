@@ -11,8 +11,7 @@ from torch import Tensor
 
 from ..calibration import CalibrationWarning, Press, calibrate
 from ..core.checks import check_choice, check_integer, check_least, check_record, check_switch
-from ..core.files import rgb_from_bgr
-from ..core.recordings import Pixels
+from ..core.files import Pixels, rgb_from_bgr
 from ..model import Calibration, Sensor
 from ..pipeline import MODES, Conditions, DepthOutput
 from ..skin import ContactSettings

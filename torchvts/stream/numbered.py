@@ -7,8 +7,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from ..core.checks import check_positive
-from ..core.files import check_pixels
-from ..core.recordings import Pixels
+from ..core.files import Pixels, check_pixels
 from .sources import MOST_FPS, SETTLING, Reader, Unreadable, time_of
 from .stages import StageClock
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ..core.checks import check_positive
-from ..core.recordings import Pixels
+from ..core.files import Pixels
 from .live import TactileFrame
 
 if TYPE_CHECKING:

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from ..core.checks import check_path
-from ..core.files import VIDEO_SUFFIXES, make_folder, write_atomically, write_pixels
-from ..core.recordings import Pixels, image_files
+from ..core.files import VIDEO_SUFFIXES, Pixels, make_folder, write_atomically, write_pixels
+from ..core.recordings import image_files
 from .sources import SETTLING, Reader, Unreadable, times_file
 from .video import InTurn, VideoFile
 

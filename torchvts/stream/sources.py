@@ -13,9 +13,9 @@ from typing import Any, NamedTuple, Protocol
 from torch import Tensor
 
 from ..core.checks import brief, check_integer, check_least, check_path, check_positive, check_record, parse_number
-from ..core.files import IMAGE_SUFFIXES, VIDEO_SUFFIXES, rgb_from_bgr
+from ..core.containers import find_container
+from ..core.files import IMAGE_SUFFIXES, REMEDIES, VIDEO_SUFFIXES, Pixels, rgb_from_bgr
 from ..core.recordings import (
-    Pixels,
     RawFrame,
     cut_short,
     image_files,
@@ -271,16 +271,19 @@ class FileReader:
 
 
 def frames(source: str | int | Path) -> Iterator[tuple[str, Tensor]]:
-    """The frames of an image, a folder of images, a TIFF of several pages, a video or a camera: pairs of a name and an image.
+    """The frames of an image, a folder, a TIFF of several pages, a video, a container or a camera: pairs of a name and an image.
 
     Images are (3, H, W) float32 in [0, 1], R, G, B, as they are: ``sensor.rectify`` cuts them. A camera gives all its frames, until
     it stops or nobody asks.
 
     Args:
-        source: a path; or a camera by its index, name, path or URL, as :func:`open_source` takes it.
+        source: a path, which goes on inside a container of several recordings (``day.h5/left/rgb``); or a camera by its index,
+            name, path or URL, as :func:`open_source` takes it.
     Raises:
         FileNotFoundError: no such file or folder, and no such camera.
-        ValueError: no images in the folder; while frames are asked for: a file that cannot be read.
+        ImportError: the library of a container is not installed.
+        ValueError: no images in the folder, or several recordings of which none is named; while frames are asked for: a file
+            that cannot be read.
         OSError: no such camera, or it has stopped.
     Example:
         >>> import tempfile, torch, torchvts as vts
@@ -291,7 +294,7 @@ def frames(source: str | int | Path) -> Iterator[tuple[str, Tensor]]:
         [('0', torch.Size([3, 4, 6])), ('1', torch.Size([3, 4, 6]))]
     """
     path = None if isinstance(source, int) else check_path("source", source)
-    if path is not None and path.exists() and find_camera(str(path)) is None:
+    if path is not None and (path.exists() or find_container(path)) and find_camera(str(path)) is None:
         return ((frame.name, rgb_from_bgr(frame.read())) for frame in raw_frames(path))
     return _of_camera(open_source(source))
 
@@ -309,7 +312,7 @@ def _of_camera(reader: Reader) -> Iterator[tuple[str, Tensor]]:
 
 
 def open_source(source: str | int | Path, reconnect_s: float = 0.0, settings: CameraSettings = AS_IT_IS) -> Reader:
-    """Open a camera (:func:`find_camera`), a network camera by its URL, a video, an image or TIFF, or a folder of images.
+    """Open a camera (:func:`find_camera`), a network camera by its URL, or what :func:`frames` reads.
 
     Args:
         source: what to open.
@@ -337,7 +340,7 @@ def open_source(source: str | int | Path, reconnect_s: float = 0.0, settings: Ca
         raise ValueError(f"settings: size, rate, exposure and white balance are those of a camera of this machine, got {text}")
     if isinstance(source, str) and source.lower().startswith(URLS):
         return LiveReader(lambda: Camera(source), reconnect_s)
-    if path.is_dir():
+    if path.is_dir() or find_container(path):
         return FileReader(path)
     if not path.is_file():
         raise FileNotFoundError(
@@ -346,7 +349,8 @@ def open_source(source: str | int | Path, reconnect_s: float = 0.0, settings: Ca
         )
     known = VIDEO_SUFFIXES + IMAGE_SUFFIXES
     if path.suffix.lower() not in known:
-        raise ValueError(f"source: {path}: expected a video or an image ({', '.join(known)}), a folder or a camera's index")
+        remedy = REMEDIES.get(path.suffix.lower(), f"one of {', '.join(known)}, a folder, or a camera's index")
+        raise ValueError(f"source: {path}: expected a video, an image or a container: {remedy}")
     return FileReader(path)
 
 

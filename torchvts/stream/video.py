@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from ..core.checks import check_path, check_positive
-from ..core.files import check_text_name, write_atomically
-from ..core.recordings import Pixels, open_video
+from ..core.files import Pixels, check_text_name, write_atomically
+from ..core.videos import open_video
 
 CODES = {".webm": "VP80", ".mp4": "mp4v", ".avi": "MJPG", ".mkv": "FFV1"}
 """Suffixes of the videos that can be written, and OpenCV's code for each."""

@@ -1,0 +1,72 @@
+"""Video files by OpenCV: their frames in order, their rate and their codec."""
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+from .files import Pixels, check_text_name
+
+ASSUMED_FPS = 30.0
+"""Frames a second of images that say nothing of their times."""
+
+
+def open_video(path: Path) -> Any:
+    """OpenCV's capture of a video file, which may not be opened.
+
+    Raises:
+        ValueError: the name is not UTF-8.
+    """
+    import cv2
+
+    return cv2.VideoCapture(check_text_name("video", path))
+
+
+def video_reads(path: Path) -> Iterator[Callable[[], Pixels]]:
+    """Go through the frames of a video; each is decoded by a call, before the next is asked for.
+
+    Raises:
+        ValueError: it gives none, its name is not UTF-8, or in the call: the frame cannot be decoded.
+    """
+    capture, number = open_video(path), 0
+
+    def read() -> Pixels:
+        there, pixels = capture.retrieve()
+        if not there:
+            raise ValueError(f"{path}: frame {number} cannot be decoded")
+        return pixels  # type: ignore[no-any-return]
+
+    try:
+        while capture.grab():
+            yield read
+            number += 1
+    finally:
+        capture.release()
+    if number == 0:
+        raise ValueError(f"{path}: not a video, or cut short: no frame could be read")
+
+
+def frames_a_second(capture: Any) -> float:
+    """Rate of an OpenCV capture; :data:`ASSUMED_FPS` where it does not know."""
+    import cv2
+
+    fps = float(capture.get(cv2.CAP_PROP_FPS))
+    return fps if 0.5 <= fps <= 1000.0 else ASSUMED_FPS
+
+
+CODECS = {
+    **dict.fromkeys(("FMP4", "mp4v", "XVID", "DIVX", "DX50", "MP42", "MP43"), "MPEG-4"),
+    **dict.fromkeys(("h264", "H264", "avc1", "X264"), "H.264"),
+    **dict.fromkeys(("hevc", "HEVC", "hvc1", "hev1"), "H.265"),
+    **dict.fromkeys(("MJPG", "mjpg"), "Motion JPEG"),
+    **dict.fromkeys(("FFV1", "HFYU", "FFVH", "MPNG", "png ", "I420", "YUY2", "YUYV", "\0\0\0\0"), ""),
+}
+"""OpenCV's codes of codecs, and the names of those that lose something; others are shown by their code."""
+
+
+def lossy_codec(capture: Any) -> str:
+    """Name of the codec of an OpenCV capture; empty where it loses nothing, or is not known."""
+    import cv2
+
+    code = int(capture.get(cv2.CAP_PROP_FOURCC))
+    letters = max(code, 0).to_bytes(8, "little")[:4].decode("latin-1")
+    return CODECS.get(letters, letters)

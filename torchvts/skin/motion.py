@@ -21,7 +21,7 @@ from ..core.geometry import gradient_of_depth
 from ..model.calibration import Calibration, check_calibration
 from ..model.markers import find_dots
 from .dot_motion import DotMotion
-from .dots import DotTemplates
+from .dots import DotTemplates, quadratic
 
 PEDESTAL = 0.25
 """Added to the light before its logarithm: dark pixels are all noise in a ratio."""
@@ -35,11 +35,14 @@ COARSE_PATCH = 0.55
 FEWEST = 8
 """Dots that a skin has at least; fewer are dust."""
 
-NEIGHBOURS = 24
-"""A dot's neighbours: the two rings around it."""
+REACH = 0.8
+"""Of the dots around a dot, in spacings."""
 
-REACH = 1.2
-"""Of a neighbour's say, in spacings."""
+LEAST_AROUND = 0.03
+"""A dot's neighbours have so much of a Gaussian of this reach: the two rings around it."""
+
+KNOWN = 0.3
+"""Variance of a place that others tell, in units of the process."""
 
 AGREES = 0.3
 """A dot that differs by so many spacings from what its neighbours expect is another."""
@@ -50,8 +53,17 @@ ROUNDS = 12
 STEPS = 5
 """By the templates' derivatives, at each level; then a frame's own derivatives settle the place in three."""
 
-BEND = 0.1
-"""Error of a dot whose skin bends, in units of how far its neighbours miss it times the square of diameter over spacing."""
+SETTLES = 2
+"""Steps by the frame's own derivatives before the last, which carries the gradient."""
+
+LENGTH = 2.2
+"""Of the Gaussian process of motion, in spacings."""
+
+NUGGET = 1e-4
+"""Its noise, in units of its variance."""
+
+BEND_SHARE = 0.45
+"""Skin bends more smoothly within a dot than the process (Matern 5/2) says: standard deviation, measured in units of it."""
 
 NEAREST_CAMERA_MM = 20.0
 """Height of a camera above the skin where none is known, at least."""
@@ -84,9 +96,13 @@ class SkinMotion(nn.Module):
 
     rest_px: Tensor
     camera: Tensor
-    index: Tensor
-    offset: Tensor
-    reach: Tensor
+    around: Tensor
+    beside: Tensor
+    terms: Tensor
+    alike: Tensor
+    slopes: Tensor
+    by_bend: Tensor
+    prior: Tensor
 
     def __init__(
         self,
@@ -115,22 +131,20 @@ class SkinMotion(nn.Module):
                 f"background: expected a skin with at least {FEWEST} printed dots that lie wholly in view, got {len(dots)}: a skin "
                 "without dots shows no motion that could be told from a change of light"
             )
-        distance = torch.cdist(dots, dots).fill_diagonal_(math.inf)
-        self.spacing_px = float(distance.amin(dim=1).median())
-        near, index = distance.topk(min(NEIGHBOURS, len(dots) - 1), largest=False)
-        apart = (dots[index] - dots[:, None]) / self.spacing_px
+        distance = torch.cdist(dots, dots)
+        self.spacing_px = float(distance.topk(2, largest=False).values[:, 1].median())
         self.knows_camera = camera_mm is not None
         x, y, height = (0.0, 0.0, math.inf) if camera_mm is None else check_camera(camera_mm)
-        self.agrees, self.rounds, self.steps, self.settles, self.nearest_mm = AGREES, ROUNDS, STEPS, 2, NEAREST_CAMERA_MM
-        self.bend, self.pedestal, self.depth_share, self.depth_mm = BEND, PEDESTAL, DEPTH_SHARE, DEPTH_MM
+        self.agrees_px, self.rounds, self.steps, self.settles = AGREES * self.spacing_px, ROUNDS, STEPS, SETTLES
+        self.nearest_mm, self.pedestal, self.depth_share, self.depth_mm = NEAREST_CAMERA_MM, PEDESTAL, DEPTH_SHARE, DEPTH_MM
+        self.nugget, self.bend_share, self.known, self.least_around = NUGGET, BEND_SHARE, KNOWN, LEAST_AROUND
         for name, value in (
             ("rest_px", dots),
             ("camera", torch.tensor([x, y, 1.0 / height], dtype=torch.float64)),
-            ("index", index),
-            ("offset", torch.cat((torch.ones_like(apart[..., :1]), apart), dim=-1)),  # (N, K, 3)
-            ("reach", torch.exp(-0.5 * (near / (REACH * self.spacing_px)).square())),
+            ("around", torch.exp(-0.5 * (distance / (REACH * self.spacing_px)).square())),
+            ("beside", distance < 1.6 * self.spacing_px),
         ):
-            self.register_buffer(name, value if value.dtype == torch.long else value.to(background.dtype))
+            self.register_buffer(name, value if value.dtype == torch.bool else value.to(background.dtype))
         grey = self.log_light(background[None])
         half = min(PATCH * self.diameter_px, 0.5 * self.spacing_px)
         self.rim_px = 0.8 * half
@@ -138,6 +152,23 @@ class SkinMotion(nn.Module):
         cell = max(1, int(blur_px / 2.0))
         self.coarse = DotTemplates(grey, dots, COARSE_PATCH * self.spacing_px, cell, blur_px)
         self.fine = DotTemplates(grey, dots, half, max(1, int(self.diameter_px / 10.0)), 0.1 * self.diameter_px)
+        self.register_buffer("terms", torch.cat((self.fine.patch, quadratic(self.fine.patch)), dim=-1))
+        # a Gaussian process of motion: alike at dots, with derivatives at them, and what bends do to places
+        length = LENGTH * self.spacing_px
+        far = (dots[:, None] - dots).double() / length
+        r = math.sqrt(5.0) * far.norm(dim=-1, keepdim=True)
+        x, y = far[..., :1], far[..., 1:]
+        second = torch.cat((1.0 + r - 5.0 * x * x, -5.0 * x * y, 1.0 + r - 5.0 * y * y), -1) / length
+        slopes = torch.cat(((1.0 + r) * far, second), -1) * torch.exp(-r) * (-5.0 / (3.0 * length))
+        by_bend = self.fine.by_bend.double()
+        self.nugget = NUGGET
+        for name, value in (
+            ("alike", ((1.0 + r + r * r / 3.0) * torch.exp(-r))[..., 0]),
+            ("slopes", slopes.mT),
+            ("by_bend", torch.einsum("nkjq,nmq->nkjm", by_bend, slopes[..., 2:]).flatten(1, 2)),
+            ("prior", torch.einsum("nkjq,qr,nljr->nkl", by_bend, torch.tensor([[3.0, 0, 1], [0, 1, 0], [1, 0, 3]], dtype=torch.float64) * 25.0 / 3.0 / length**4, by_bend)),
+        ):
+            self.register_buffer(name, value.to(background.dtype))
 
     @classmethod
     def from_calibration(cls, calibration: Calibration, camera_mm: tuple[float, float, float] | None = None) -> "SkinMotion":
@@ -202,12 +233,13 @@ class SkinMotion(nn.Module):
         grey = self.log_light(images)
         coarse, fine = self.coarse.prepare(grey.detach()), self.fine.prepare(grey)
         place, seen = self.find(coarse, fine.detach(), last)
-        warp = self.warp(place, seen)
+        around, bend = self.surroundings(place, seen)
         most_px = 0.3 * self.diameter_px
         for _ in range(self.settles):
-            place = self.fine.settle(fine.detach(), place, warp, most_px).place
-        settled = self.fine.settle(fine, place, warp, most_px)
-        return self.in_mm(settled.place, settled.covariance + self.doubt(place, seen), seen & settled.there, depth_mm)
+            place = self.fine.settle(fine.detach(), place, around, most_px).place
+        settled = self.fine.settle(fine, place, around, most_px)
+        noise = settled.covariance * seen[..., None, None].to(place.dtype)
+        return self.in_mm(settled.place, noise + bend, seen & settled.there, depth_mm)
 
     def log_light(self, images: Tensor) -> Tensor:
         """(B, 1, H, W): mean of the channels' logarithms, in which light from opposite sides cancels."""
@@ -221,13 +253,12 @@ class SkinMotion(nn.Module):
         place, seen = self.register(coarse, fine, start)
         seen = self.joined(place, seen) if last is None else self.consistent(place, start, seen)
         for _ in range(self.rounds if last is None else 1):
-            expected, support = self.expected(place, start, seen)
-            wanted = ~seen & (support > 1.0) & self.in_view(expected)
+            expected, variance = self.expected(place, start, seen)
+            wanted = ~seen & (variance < self.known) & self.in_view(expected)
             if not bool(wanted.any()):
                 break
             tried, there = self.register(coarse, fine, expected)
-            near = (tried - expected).square().sum(-1).sqrt() < self.agrees * self.spacing_px
-            gained = wanted & there & near
+            gained = wanted & there & ((tried - expected).square().sum(-1).sqrt() < self.agrees_px)
             if not bool(gained.any()):
                 break
             place = torch.where(gained[..., None], tried, place)
@@ -245,65 +276,71 @@ class SkinMotion(nn.Module):
         x, y, rim = place[..., 0], place[..., 1], self.rim_px
         return (x > rim) & (y > rim) & (x < float(self.width) - 1.0 - rim) & (y < float(self.height) - 1.0 - rim)
 
+    def process(self, moved: Tensor, seen: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """The Gaussian process through motions (B, N, 2) of seen dots.
+
+        Returns:
+            The shares of dots in its mean, (B, N, 2), its inverse covariance, (B, N, N), in units of its variance, and this
+            variance around each dot, (B, N): that with which others miss the dots there, as large as it should be.
+        Source:
+            Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, eq. 2.25 and 5.12 (leave one out).
+        """
+        known = seen.to(moved.dtype)
+        system = self.alike * known[:, :, None] * known[:, None] + torch.diag_embed(self.nugget + 1.0 - known)
+        inverse = torch.cholesky_inverse(torch.linalg.cholesky(system))
+        shares = inverse @ (moved * known[..., None])
+        missed = 0.5 * shares.square().sum(-1) / inverse.diagonal(dim1=1, dim2=2)
+        return shares, inverse, (self.around @ missed[..., None])[..., 0] / (self.around @ known[..., None])[..., 0].clamp_min(1e-3)
+
     def expected(self, place: Tensor, start: Tensor, seen: Tensor) -> tuple[Tensor, Tensor]:
-        """Places (B, N, 2) px where the motion of seen neighbours from a start expects dots, and how many these are, (B, N)."""
-        plane, support = self.plane(place - start, seen, 0.0)
-        return start + plane[..., 0, :], support
+        """Places (B, N, 2) px where the motion of other dots from a start expects dots, and the variance (B, N) in units of all."""
+        moved = place - start
+        shares, inverse, _ = self.process(moved, seen)
+        left_out = 1.0 / inverse.diagonal(dim1=1, dim2=2)
+        alike = self.alike * seen.to(place.dtype)[:, None]
+        mean = torch.where(seen[..., None], moved - shares * left_out[..., None], alike @ shares)
+        return start + mean, torch.where(seen, left_out, 1.0 - ((alike @ inverse) * alike).sum(-1))
 
-    def warp(self, place: Tensor, seen: Tensor) -> Tensor:
-        """(B, N, 2, 2): what the motion makes of the skin around each dot."""
-        plane, _ = self.plane(place - self.rest_px, seen, 1.0)
+    def surroundings(self, place: Tensor, seen: Tensor) -> tuple[Tensor, Tensor]:
+        """Patches (B, N, P, 2) px as the process bends them, and the covariance (B, N, 2, 2) px^2 beside noise.
+
+        Of a seen dot what is not known of its bend, of another what is not known of its place.
+        """
+        shares, inverse, variance = self.process(place - self.rest_px, seen)
+        slopes = self.slopes @ shares[:, None]  # (B, N, 5, 2)
+        around = self.fine.patch + self.terms @ torch.cat((slopes[..., :2, :].clamp(-0.6, 0.6), slopes[..., 2:, :]), -2)
+        known = seen.to(place.dtype)
+        bend = (self.by_bend * known[:, None, None]).flatten(1, 2)  # (B, 4 N, N): of both axes by bends along both
+        half = (bend @ inverse).reshape(len(place), -1, 2, 2, place.shape[1])
+        told = half.flatten(3) @ bend.reshape(half.shape).flatten(3).mT
+        unknown = 1.0 - ((self.alike * known[:, None] @ inverse) * self.alike).sum(-1)
         same = torch.eye(2, dtype=place.dtype, device=place.device)
-        return same + (plane[..., 1:, :].mT / self.spacing_px).clamp(-0.6, 0.6)
-
-    def plane(self, moved: Tensor, seen: Tensor, own: float) -> tuple[Tensor, Tensor]:
-        """Plane (B, N, 3, 2) through the motions (B, N, 2) of seen neighbours, by spacings, and how many these are, (B, N)."""
-        around = moved[:, self.index]  # (B, N, K, 2)
-        weight = self.reach * seen[:, self.index].to(moved.dtype)
-        columns = weight[..., None] * self.offset
-        known = own * seen.to(moved.dtype)[..., None]
-        ridge = torch.tensor([1e-6, 0.02, 0.02], dtype=moved.dtype, device=moved.device)
-        ridge = ridge + known * torch.tensor([1.0, 0.0, 0.0], dtype=moved.dtype, device=moved.device)
-        right = columns.mT @ around
-        right = torch.cat((right[..., :1, :] + (known * moved)[..., None, :], right[..., 1:, :]), dim=-2)
-        return torch.linalg.solve(columns.mT @ self.offset + torch.diag_embed(ridge), right), weight.sum(-1)
-
-    def doubt(self, place: Tensor, seen: Tensor) -> Tensor:
-        """Covariance (B, N, 2, 2) px^2 beside noise: of a seen dot what its bend hides, of another how its neighbours may err."""
-        expected, support = self.expected(place, self.rest_px[None].expand_as(place), seen)
-        miss = (place - expected).square().sum(-1)
-        bend = (self.bend * self.diameter_px**2 / self.spacing_px**2) ** 2 * miss
-        known = seen.to(place.dtype) * (support > 1.0).to(place.dtype)
-        usual = (miss * known).sum(-1, keepdim=True) / known.sum(-1, keepdim=True).clamp_min(1.0)
-        unknown = torch.where(support > 1.0, usual + (0.1 * self.spacing_px) ** 2, self.spacing_px**2)
-        return torch.diag_embed(torch.where(seen, bend, unknown)[..., None].expand(-1, -1, 2))
+        return around, variance[..., None, None] * torch.where(
+            seen[..., None, None], self.bend_share**2 * (self.prior - told), unknown[..., None, None] * same
+        )
 
     def consistent(self, place: Tensor, start: Tensor, seen: Tensor) -> Tensor:
         """Seen dots without those that contradict their neighbours or share a place with a better one, the worst first."""
         miss = torch.zeros_like(place[..., 0])
         for _ in range(self.rounds):
-            expected, support = self.expected(place, start, seen)
-            miss = (place - expected).square().sum(-1).sqrt() * (seen & (support > 1.0)).to(place.dtype)
-            worst = miss >= miss[:, self.index].amax(-1)
-            worst = worst & (miss > self.agrees * self.spacing_px)
+            expected, variance = self.expected(place, start, seen)
+            miss = (place - expected).square().sum(-1).sqrt() * (seen & (variance < self.known)).to(place.dtype)
+            worst = (miss > self.agrees_px) & (miss >= (miss[:, None] * self.around.gt(self.least_around)).amax(-1))
             if not bool(worst.any()):
                 break
             seen = seen & ~worst
         apart = torch.cdist(place, place) + self.spacing_px * torch.eye(place.shape[1], dtype=place.dtype, device=place.device)
-        other = (apart < self.agrees * self.spacing_px) & seen[:, None] & (miss[:, None] <= miss[:, :, None])
+        other = (apart < self.agrees_px) & seen[:, None] & (miss[:, None] <= miss[:, :, None])
         return seen & ~other.any(-1)
 
     def joined(self, place: Tensor, seen: Tensor) -> Tensor:
         """Seen dots that neighbours which agree with them join to most of the others."""
         moved = place - self.rest_px
-        agree = (moved[:, self.index] - moved[:, :, None]).square().sum(-1).sqrt() < 1.5 * self.agrees * self.spacing_px
-        beside = self.offset[..., 1:].square().sum(-1) < 1.6**2
-        agree = agree & beside & seen[:, self.index] & seen[..., None]
-        own = torch.arange(1, place.shape[1] + 1, device=place.device).expand(place.shape[0], -1)
-        label = torch.where(seen, own, 0)
+        agree = (torch.cdist(moved, moved) < 1.5 * self.agrees_px) & self.beside & seen[:, None] & seen[:, :, None]
+        label = torch.where(seen, torch.arange(1, place.shape[1] + 1, device=place.device), 0)
         for _ in range(place.shape[1]):
             before = label
-            label = torch.maximum(label, torch.where(agree, label[:, self.index], 0).amax(-1))
+            label = torch.maximum(label, torch.where(agree, label[:, None], 0).amax(-1))
             if bool((label == before).all()):
                 break
         sizes = torch.zeros_like(place[..., 0]).scatter_add(1, (label - 1).clamp_min(0), seen.to(place.dtype))

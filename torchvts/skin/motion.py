@@ -20,7 +20,7 @@ from ..core.checks import (
 from ..core.geometry import gradient_of_depth
 from ..model.calibration import Calibration, check_calibration
 from ..model.markers import find_dots
-from .dot_motion import DotMotion
+from .dot_motion import DotMotion, matern
 from .dots import DotTemplates, quadratic
 
 PEDESTAL = 0.25
@@ -50,20 +50,17 @@ AGREES = 0.3
 ROUNDS = 12
 """Rings of dots that are found one after another where there is no frame before."""
 
-STEPS = 5
-"""By the templates' derivatives, at each level; then a frame's own derivatives settle the place in three."""
-
-SETTLES = 2
-"""Steps by the frame's own derivatives before the last, which carries the gradient."""
-
 LENGTH = 2.2
 """Of the Gaussian process of motion, in spacings."""
 
 NUGGET = 1e-4
 """Its noise, in units of its variance."""
 
-BEND_SHARE = 0.45
+BEND_SHARE = 0.33
 """Skin bends more smoothly within a dot than the process (Matern 5/2) says: standard deviation, measured in units of it."""
+
+FLOOR_PX = 0.003
+"""Error of a place beside noise and bends: what drawn dots under a contact's shading are off without noise."""
 
 NEAREST_CAMERA_MM = 20.0
 """Height of a camera above the skin where none is known, at least."""
@@ -76,9 +73,10 @@ class SkinMotion(nn.Module):
     """Motion of the printed dots of a skin: images (B, 3, H, W) and their depth to a :class:`DotMotion`.
 
     A dot is looked for where the frame before had it. Without one, the dots that have hardly moved are found first, then, ring by
-    ring, each near where its neighbours expect it; what is not joined to most of the dots in this way is not seen. Frames of a
-    batch do not influence one another, and nothing is remembered between calls. Displacements are differentiable in the images
-    and in depth.
+    ring, each near where the others expect it (a Gaussian process); what is not joined to most of the dots in this way is not seen.
+    The process bends the patches, too: a dot tells the mean motion of its rim, which is not that of its middle where skin bends.
+    Frames of a batch do not influence one another, and nothing is remembered between calls. Displacements are differentiable in the
+    images and in depth.
 
     Args:
         background: (3, H, W) in [0, 1], the skin at rest with its dots, as the camera gives it.
@@ -115,10 +113,8 @@ class SkinMotion(nn.Module):
         super().__init__()
         check_field("background", background)
         check_range("background", background)
-        self.diameter_px, self.mm_per_pixel = (
-            check_positive("diameter_px", diameter_px),
-            check_positive("mm_per_pixel", mm_per_pixel),
-        )
+        self.diameter_px = check_positive("diameter_px", diameter_px)
+        self.mm_per_pixel = check_positive("mm_per_pixel", mm_per_pixel)
         self.height, self.width = background.shape[1], background.shape[2]
         check_float_tensor("dots_px", dots_px)
         if dots_px.dim() != 2 or dots_px.shape[1] != 2 or not bool(torch.isfinite(dots_px).all()):
@@ -135,9 +131,10 @@ class SkinMotion(nn.Module):
         self.spacing_px = float(distance.topk(2, largest=False).values[:, 1].median())
         self.knows_camera = camera_mm is not None
         x, y, height = (0.0, 0.0, math.inf) if camera_mm is None else check_camera(camera_mm)
-        self.agrees_px, self.rounds, self.steps, self.settles = AGREES * self.spacing_px, ROUNDS, STEPS, SETTLES
+        self.agrees_px, self.rounds, self.most_px = AGREES * self.spacing_px, ROUNDS, 0.3 * self.diameter_px
         self.nearest_mm, self.pedestal, self.depth_share, self.depth_mm = NEAREST_CAMERA_MM, PEDESTAL, DEPTH_SHARE, DEPTH_MM
-        self.nugget, self.bend_share, self.known, self.least_around = NUGGET, BEND_SHARE, KNOWN, LEAST_AROUND
+        self.nugget, self.known, self.least_around = NUGGET, KNOWN, LEAST_AROUND
+        self.bend_share, self.floor_px = BEND_SHARE, FLOOR_PX
         for name, value in (
             ("rest_px", dots),
             ("camera", torch.tensor([x, y, 1.0 / height], dtype=torch.float64)),
@@ -153,20 +150,20 @@ class SkinMotion(nn.Module):
         self.coarse = DotTemplates(grey, dots, COARSE_PATCH * self.spacing_px, cell, blur_px)
         self.fine = DotTemplates(grey, dots, half, max(1, int(self.diameter_px / 10.0)), 0.1 * self.diameter_px)
         self.register_buffer("terms", torch.cat((self.fine.patch, quadratic(self.fine.patch)), dim=-1))
-        # a Gaussian process of motion: alike at dots, with derivatives at them, and what bends do to places
+        # the process: how alike dots move, derivatives of this, and what bends do to places
         length = LENGTH * self.spacing_px
         far = (dots[:, None] - dots).double() / length
         r = math.sqrt(5.0) * far.norm(dim=-1, keepdim=True)
-        x, y = far[..., :1], far[..., 1:]
-        second = torch.cat((1.0 + r - 5.0 * x * x, -5.0 * x * y, 1.0 + r - 5.0 * y * y), -1) / length
-        slopes = torch.cat(((1.0 + r) * far, second), -1) * torch.exp(-r) * (-5.0 / (3.0 * length))
+        bends = torch.stack((far[..., 0] ** 2, far[..., 0] * far[..., 1], far[..., 1] ** 2), -1)
+        bends = ((1.0 + r) * torch.tensor([1.0, 0.0, 1.0], dtype=torch.float64) - 5.0 * bends) / length
+        slopes = torch.cat(((1.0 + r) * far, bends), -1) * torch.exp(-r) * (-5.0 / (3.0 * length))
+        prior = torch.tensor([[3, 0, 1], [0, 1, 0], [1, 0, 3]], dtype=torch.float64) * (25.0 / 3.0 / length**4)  # of bends
         by_bend = self.fine.by_bend.double()
-        self.nugget = NUGGET
         for name, value in (
-            ("alike", ((1.0 + r + r * r / 3.0) * torch.exp(-r))[..., 0]),
+            ("alike", matern(far.norm(dim=-1))),
             ("slopes", slopes.mT),
             ("by_bend", torch.einsum("nkjq,nmq->nkjm", by_bend, slopes[..., 2:]).flatten(1, 2)),
-            ("prior", torch.einsum("nkjq,qr,nljr->nkl", by_bend, torch.tensor([[3.0, 0, 1], [0, 1, 0], [1, 0, 3]], dtype=torch.float64) * 25.0 / 3.0 / length**4, by_bend)),
+            ("prior", torch.einsum("nkjq,qr,nljr->nkl", by_bend, prior, by_bend)),
         ):
             self.register_buffer(name, value.to(background.dtype))
 
@@ -233,13 +230,20 @@ class SkinMotion(nn.Module):
         grey = self.log_light(images)
         coarse, fine = self.coarse.prepare(grey.detach()), self.fine.prepare(grey)
         place, seen = self.find(coarse, fine.detach(), last)
-        around, bend = self.surroundings(place, seen)
-        most_px = 0.3 * self.diameter_px
-        for _ in range(self.settles):
-            place = self.fine.settle(fine.detach(), place, around, most_px).place
-        settled = self.fine.settle(fine, place, around, most_px)
-        noise = settled.covariance * seen[..., None, None].to(place.dtype)
-        return self.in_mm(settled.place, noise + bend, seen & settled.there, depth_mm)
+        same = torch.eye(2, dtype=place.dtype, device=place.device)
+        place = torch.where(seen[..., None], self.fine.step(fine.detach(), place, self.fine.patch, same), place)
+        around, warp, beside = self.surroundings(place, seen)
+        for _ in range(2):
+            place = torch.where(seen[..., None], self.fine.step(fine.detach(), place, around, warp), place)
+        settled = self.fine.settle(fine, place, around, self.most_px)
+        place = settled.place
+        if place.requires_grad:  # a dot that moves bends the skin in others
+            shares = self.process(place - self.rest_px, seen)[0]
+            by_bend = self.by_bend.reshape(-1, 2, 2, place.shape[1])
+            bends = torch.einsum("nkjm,bmj->bnk", by_bend, shares - shares.detach())
+            place = place - (warp @ bends[..., None])[..., 0]
+        noise = (settled.covariance + self.floor_px**2 * same) * seen[..., None, None].to(place.dtype)
+        return self.in_mm(place, noise + beside, seen & settled.there, depth_mm)
 
     def log_light(self, images: Tensor) -> Tensor:
         """(B, 1, H, W): mean of the channels' logarithms, in which light from opposite sides cancels."""
@@ -267,8 +271,8 @@ class SkinMotion(nn.Module):
 
     def register(self, coarse: Tensor, fine: Tensor, start: Tensor) -> tuple[Tensor, Tensor]:
         """Places of dots (B, N, 2) px from a start, and whether they are there."""
-        place, _ = self.coarse.follow(coarse, start, self.steps, 0.35 * self.spacing_px)
-        place, there = self.fine.follow(fine, place, self.steps, 0.3 * self.diameter_px)
+        place, _ = self.coarse.search(coarse, start, 0.35 * self.spacing_px)
+        place, there = self.fine.search(fine, place, self.most_px)
         return place, there & self.in_view(place)
 
     def in_view(self, place: Tensor) -> Tensor:
@@ -301,22 +305,26 @@ class SkinMotion(nn.Module):
         mean = torch.where(seen[..., None], moved - shares * left_out[..., None], alike @ shares)
         return start + mean, torch.where(seen, left_out, 1.0 - ((alike @ inverse) * alike).sum(-1))
 
-    def surroundings(self, place: Tensor, seen: Tensor) -> tuple[Tensor, Tensor]:
-        """Patches (B, N, P, 2) px as the process bends them, and the covariance (B, N, 2, 2) px^2 beside noise.
+    def surroundings(self, place: Tensor, seen: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Patches (B, N, P, 2) px as the process bends them, their warp (B, N, 2, 2), and a covariance (B, N, 2, 2) px^2.
 
-        Of a seen dot what is not known of its bend, of another what is not known of its place.
+        This is of a seen dot what is not known of its bend, of another what is not known of its place.
         """
         shares, inverse, variance = self.process(place - self.rest_px, seen)
         slopes = self.slopes @ shares[:, None]  # (B, N, 5, 2)
-        around = self.fine.patch + self.terms @ torch.cat((slopes[..., :2, :].clamp(-0.6, 0.6), slopes[..., 2:, :]), -2)
+        slopes = torch.cat((slopes[..., :2, :].clamp(-0.6, 0.6), slopes[..., 2:, :]), -2)
+        around = self.fine.patch + self.terms @ slopes
         known = seen.to(place.dtype)
         bend = (self.by_bend * known[:, None, None]).flatten(1, 2)  # (B, 4 N, N): of both axes by bends along both
         half = (bend @ inverse).reshape(len(place), -1, 2, 2, place.shape[1])
         told = half.flatten(3) @ bend.reshape(half.shape).flatten(3).mT
         unknown = 1.0 - ((self.alike * known[:, None] @ inverse) * self.alike).sum(-1)
         same = torch.eye(2, dtype=place.dtype, device=place.device)
-        return around, variance[..., None, None] * torch.where(
-            seen[..., None, None], self.bend_share**2 * (self.prior - told), unknown[..., None, None] * same
+        return (
+            around,
+            same + slopes[..., :2, :].mT,
+            variance[..., None, None]
+            * torch.where(seen[..., None, None], self.bend_share**2 * (self.prior - told), unknown[..., None, None] * same),
         )
 
     def consistent(self, place: Tensor, start: Tensor, seen: Tensor) -> Tensor:

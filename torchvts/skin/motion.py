@@ -255,18 +255,25 @@ class SkinMotion(nn.Module):
         start = self.rest_px[None].expand(count, -1, -1) if last is None else self.px_of(last.displacement_mm.detach())
         start = start.expand(count, -1, -1)
         place, seen = self.register(coarse, fine, start)
-        seen = self.joined(place, seen) if last is None else self.consistent(place, start, seen)
+        if last is None:
+            seen = self.joined(place, seen)
+        seen = self.consistent(place, start, seen)
+        if last is None:  # without those that what contradicted them joined to others
+            seen = self.joined(place, seen)
         for _ in range(self.rounds if last is None else 1):
             expected, variance = self.expected(place, start, seen)
             wanted = ~seen & (variance < self.known) & self.in_view(expected)
             if not bool(wanted.any()):
                 break
             tried, there = self.register(coarse, fine, expected)
-            gained = wanted & there & ((tried - expected).square().sum(-1).sqrt() < self.agrees_px)
+            near = (tried - expected).square().sum(-1).sqrt() < self.agrees_px * (1.0 - variance / self.known)  # else next round
+            gained = wanted & there & near
             if not bool(gained.any()):
                 break
             place = torch.where(gained[..., None], tried, place)
             seen = self.consistent(place, start, seen | gained)
+            if last is None:
+                seen = self.joined(place, seen)
         return torch.where(seen[..., None], place, self.expected(place, start, seen)[0]), seen
 
     def register(self, coarse: Tensor, fine: Tensor, start: Tensor) -> tuple[Tensor, Tensor]:

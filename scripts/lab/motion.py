@@ -14,10 +14,12 @@ from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 
 from torchvts import viz
+from torchvts.core.blur import blur, gaussian_weights
 from torchvts.core.files import IMAGE_SUFFIXES, natural_order, read_image
 from torchvts.model.markers import FillMarkers, find_dots
 from torchvts.scenes import DottedSkin, Drag
 from torchvts.skin import DotMotion, SkinMotion
+from torchvts.skin.motion import DEPTH_MM, DEPTH_SHARE
 
 PITCH = 0.0634
 """Of the drawn sensors, mm; drags are given in pixels."""
@@ -82,7 +84,6 @@ class Row:
     way: str
     error_px: list[float] = field(default_factory=list)
     ratio: list[float] = field(default_factory=list)
-    depth_um: list[float] = field(default_factory=list)
     wrong: int = 0
     missing: int = 0
     dots: int = 0
@@ -250,12 +251,19 @@ def run_pairs(names: list[str], seeds: int) -> Iterator[Row]:
                 known = np.logical_not(np.isnan(found).any(axis=1))
                 rows[way].add(found - seen, np.asarray(known), inside, absent)
             with torch.no_grad():
-                got = unit.motion(frame[None], depth)
+                got = unit.motion(frame[None], off_depth(depth, seed))
             error, known = (got.displacement_mm[0].double() - true).numpy(), got.seen[0].numpy()
             std = got.covariance_mm2[0].diagonal(dim1=1, dim2=2).sqrt().numpy() / PITCH
             rows[OURS].add(error[:, :2] / PITCH, known, inside, absent, std[:, :2])
-            rows[OURS].depth_um += (1e3 * error[inside & known, 2]).tolist()
         yield from rows.values()
+
+
+def off_depth(depth: Tensor, seed: int) -> Tensor:
+    """Depth (1, 1, H, W) mm with as smooth and large an error as the module takes it to have."""
+    draw = torch.Generator().manual_seed(seed)
+    height, width = depth.shape[2:]
+    error = blur(torch.randn(1, 1, height + 120, width + 120, generator=draw), gaussian_weights(20.0))[..., 60:-60, 60:-60]
+    return depth + (DEPTH_SHARE * depth).hypot(torch.tensor(DEPTH_MM)) * error * (40.0 * np.pi**0.5)
 
 
 def run_fields(seeds: int) -> Iterator[tuple[str, str, Row]]:
@@ -504,7 +512,7 @@ def pairs_table(rows: list[Row]) -> str:
 
 def to_json(rows: list[Any]) -> str:
     """The rows without their single errors."""
-    drop = ("error_px", "ratio", "depth_um")
+    drop = ("error_px", "ratio")
     return json.dumps(
         [
             {k: v for k, v in vars(row).items() if k not in drop} | ({"rms_px": row.rms_px} if isinstance(row, Row) else {})

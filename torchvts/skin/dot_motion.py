@@ -94,7 +94,7 @@ class DotMotion(NamedTuple):
         size = torch.cat((size[:, :2].square().mean(1, keepdim=True).sqrt().expand(-1, 2, -1), size[:, 2:]), 1)  # x and y alike
         best: list[Tensor] = []
         for length in LENGTHS:
-            kernel = _matern(apart / length)
+            kernel = matern(apart / length)
             for strength in STRENGTHS:
                 power = ((strength * size).clamp_min(LEAST_MM).square())[..., None]  # (B, 3, 1, 1)
                 with torch.no_grad():
@@ -107,8 +107,8 @@ class DotMotion(NamedTuple):
                 best = chosen if not best else [_where(better, one, other) for one, other in zip(chosen, best, strict=True)]
         _, power, lengths = best
         lengths = lengths[..., None, None]
-        system = power * _matern(apart / lengths) * both + torch.diag_embed(noise)
-        cross = power * _matern(far / lengths) * seen[:, :, None].to(values.dtype)  # (B, 3, M, N)
+        system = power * matern(apart / lengths) * both + torch.diag_embed(noise)
+        cross = power * matern(far / lengths) * seen[:, :, None].to(values.dtype)  # (B, 3, M, N)
         cholesky = torch.linalg.cholesky(system)
         mean = (cross @ torch.cholesky_solve(values[..., None], cholesky))[..., 0]
         known = torch.linalg.solve_triangular(cholesky, cross.mT, upper=False).square().sum(-2)
@@ -208,7 +208,8 @@ def _turned(places: Tensor, turn: Tensor) -> Tensor:
     return torch.stack((c * x - s * y, s * x + c * y), -1)
 
 
-def _matern(r: Tensor) -> Tensor:
+def matern(r: Tensor) -> Tensor:
+    """Matern 5/2, of distances in lengths."""
     r = math.sqrt(5.0) * r
     return (1.0 + r + r * r / 3.0) * torch.exp(-r)
 

@@ -1,6 +1,5 @@
 """Where printed dots of a background are in a frame: a dot's surroundings are its template, and the frame is regressed on it."""
 
-import math
 from typing import NamedTuple
 
 import torch
@@ -12,13 +11,22 @@ LEAST_LEFT = 0.35
 """A dot with less than this share of its darkness is not seen."""
 
 LEAST_EXPLAINED = 0.4
-"""Least share of what a patch holds beside a plane of light that its dot explains."""
+"""Least share of what a patch holds beside a parabola of light that its dot explains."""
 
 RIDGE = 1e-6
 """Of the regression, relative: a dot that is a line says nothing of motion along it."""
 
 SPLINE_VARIANCE = 1.0 / 3.0
 """Of the cubic B-spline through which images are sampled, px^2: it blurs by 0.58 px, and moves no ramp, as bicubic kernels do."""
+
+DIFFERENCE_PX = 0.02
+"""Step of difference quotients by a place."""
+
+STRIDE = 1.5
+"""Between the samples of a patch, in standard deviations of the blur."""
+
+STEPS, SETTLED_PX = 6, 0.005
+"""Steps of a search at most; it ends with one that moves no dot further."""
 
 
 class Settled(NamedTuple):
@@ -32,14 +40,15 @@ class Settled(NamedTuple):
 class DotTemplates(nn.Module):
     """Templates of all dots of a background at one resolution.
 
-    Light around a dot's place is regressed on the dot's template, its two derivatives, four strains and a plane of light. The share
-    of the derivatives is the displacement that is left, the share of the template how much of the dot is left, the residual the
-    noise. The matrix depends on the background alone, so that a step is one sampling and one product.
+    Light around a dot's place is regressed on the dot's template, its two derivatives, a parabola of light, four strains, and the
+    second derivatives (another blur). The share of the derivatives is the displacement that is left, the share of the template how
+    much of the dot is left, the residual the noise. The matrix depends on the background alone, so that a step is one sampling and
+    one product.
 
     Args:
         grey: (1, 1, H, W), log light of the background.
         dots_px: (N, 2).
-        half_px: half a patch.
+        half_px: radius of a patch.
         cell: side of the cells of pixels that are the level's pixels.
         blur_px: blur of the level.
     Source:
@@ -47,41 +56,50 @@ class DotTemplates(nn.Module):
     """
 
     patch: Tensor
+    corners: Tensor
     weight: Tensor
     columns: Tensor
     matrix: Tensor
     unit_covariance: Tensor
     unit_residual: Tensor
+    by_bend: Tensor
 
     def __init__(self, grey: Tensor, dots_px: Tensor, half_px: float, cell: int, blur_px: float) -> None:
         super().__init__()
-        self.cell, self.reach = cell, math.ceil(half_px / cell)
-        self.weights = gaussian_weights(blur_px / cell)
-        self.least_left, self.least_explained = LEAST_LEFT, LEAST_EXPLAINED
-        one = torch.arange(-self.reach, self.reach + 1, dtype=grey.dtype)
+        self.cell, self.weights = cell, gaussian_weights(blur_px / cell)
+        self.least_left, self.least_explained, self.steps = LEAST_LEFT, LEAST_EXPLAINED, STEPS
+        self.difference_px, self.settled_px = DIFFERENCE_PX, SETTLED_PX
+        variance = blur_px**2 + SPLINE_VARIANCE * cell**2
+        step = max(float(cell), min(STRIDE * variance**0.5, half_px / 4.0))
+        one = torch.arange(-int(half_px / step), int(half_px / step) + 1, dtype=torch.float64) * step
         patch = torch.stack(torch.meshgrid(one, one, indexing="xy"), -1).reshape(-1, 2)
-        window = torch.exp(-0.5 * (patch.norm(dim=1) * cell / (0.75 * half_px)) ** 4)
-        self.register_buffer("patch", cell * patch)
-        at_rest = torch.eye(2, dtype=grey.dtype).expand(1, len(dots_px), 2, 2)
-        values, along_x, along_y = self.sample_warped(self.prepare(grey), dots_px[None].to(grey.dtype), at_rest)
-        template, dx, dy = values[0, ..., None], along_x[0, ..., None], along_y[0, ..., None]  # (N, P, 1)
-        x, y = (patch[:, k : k + 1].expand_as(dx) * cell for k in (0, 1))
+        patch = patch[patch.norm(dim=1) <= half_px]
+        window = torch.exp(-0.5 * (patch.norm(dim=1) / (0.75 * half_px)) ** 4)
+        self.register_buffer("patch", patch.to(grey.dtype))
+        self.register_buffer("corners", torch.tensor([[0, 0], [1, 0], [0, 1], [1, 1]], dtype=grey.dtype))
+        level, places = self.prepare(grey).double(), dots_px[None, :, None].double() + patch
+        template = self.sample(level, places)[0, ..., None]  # (N, P, 1)
+        slope = self.slopes(level, places)[0]  # (N, P, 2)
         mean = (template * window[:, None]).sum(1, keepdim=True) / window.sum()
         noise = torch.exp(mean - template)  # of a logarithm: larger where it is dark
         weight = window[:, None] / noise.square()  # (N, P, 1)
-        light = torch.cat((template - mean, torch.ones_like(x), x, y), 2)
-        columns = torch.cat((dx, dy, light, dx * x, dx * y, dy * x, dy * y), 2).double()
+        terms = torch.cat((torch.ones_like(patch[:, :1]), patch, quadratic(patch)), 1).expand(len(dots_px), -1, -1)
+        along = self.difference_px * torch.eye(2, dtype=torch.float64)
+        further = [(self.slopes(level, places + one) - self.slopes(level, places - one))[0] for one in along]
+        # second derivatives: what strain and focus make of the blur of a dot's edge
+        curved = torch.stack((further[0][..., 0], further[0][..., 1], further[1][..., 1]), -1) / (2.0 * self.difference_px)
+        columns = torch.cat((slope, template - mean, terms, slope * patch[:, :1], slope * patch[:, 1:], curved), 2)
         weighed = columns * weight
         normal = weighed.mT @ columns
         ridge = RIDGE * torch.diag(normal.diagonal(dim1=1, dim2=2).mean(0).clamp_min(1e-12))
-        matrix = torch.linalg.solve(normal + ridge, weighed.mT)  # (N, 10, P)
+        matrix = torch.linalg.solve(normal + ridge, weighed.mT)  # (N, 16, P)
         # unit noise, alike in neighbours by blur, in the shares, and what of it is left in the residual
-        apart = torch.cdist(patch, patch).double()
-        alike = torch.exp(-apart.square() / (4.0 * ((blur_px / cell) ** 2 + SPLINE_VARIANCE)))
-        shares = ((matrix * noise.mT) @ alike) * noise.mT  # (N, 10, P)
+        alike = torch.exp(-torch.cdist(patch, patch).square() / (4.0 * variance))
+        shares = ((matrix * noise.mT) @ alike) * noise.mT  # (N, 16, P)
         covariance = shares @ matrix.mT
         residual = window.sum() - 2.0 * (shares * weighed.mT).sum((1, 2)) + (normal * covariance).sum((1, 2))
-        buffers = {"weight": weight[..., 0], "columns": columns, "matrix": matrix, "unit_residual": residual}
+        by_bend = torch.einsum("nkp,npj,pq->nkjq", matrix[:, :2], slope, quadratic(patch))
+        buffers = {"weight": weight[..., 0], "columns": columns, "matrix": matrix, "unit_residual": residual, "by_bend": by_bend}
         for name, value in (buffers | {"unit_covariance": covariance[:, :2, :2]}).items():
             self.register_buffer(name, value.to(grey.dtype))
 
@@ -89,28 +107,40 @@ class DotTemplates(nn.Module):
         """The level (B, 1, h, w) of log light (B, 1, H, W)."""
         return blur(nn.functional.avg_pool2d(grey, self.cell) if self.cell > 1 else grey, self.weights)
 
-    def follow(self, level: Tensor, place: Tensor, steps: int, most_px: float) -> tuple[Tensor, Tensor]:
+    def search(self, level: Tensor, place: Tensor, most_px: float) -> tuple[Tensor, Tensor]:
         """Places (B, N, 2) px after steps of at most so many px, and whether the dots are there, (B, N) bool."""
-        values = self.sample(level, place)
+        values = self.read(level, self.in_cells(place[:, :, None] + self.patch))  # linear between pixels: near enough
         fit = self.fit(values)
-        for _ in range(steps):
-            there = fit[..., 2:3] > 0.5 * self.least_left  # others stay
-            change = -fit[..., :2] / torch.where(there, fit[..., 2:3], 1.0)
-            length = change.square().sum(-1, keepdim=True).sqrt().clamp_min(most_px)
-            place = place + torch.where(there, change * (most_px / length), 0.0)
-            values = self.sample(level, place)
+        moving = torch.ones_like(place[..., 0]) > 0.0
+        for _ in range(self.steps):
+            moving = moving & (fit[..., 2] > 0.5 * self.least_left)
+            change = -fit[..., :2] / torch.where(moving, fit[..., 2], 1.0)[..., None]
+            length = change.square().sum(-1, keepdim=True).sqrt()
+            place = place + torch.where(moving[..., None], change * (most_px / length.clamp_min(most_px)), 0.0)
+            moving = moving & (length[..., 0] > self.settled_px)
+            if not bool(moving.any()):
+                break
+            values = self.read(level, self.in_cells(place[:, :, None] + self.patch))
             fit = self.fit(values)
         return place, (fit[..., 2] > self.least_left) & (self.residual(values, fit)[1] > self.least_explained)
 
-    def settle(self, level: Tensor, place: Tensor, warp: Tensor, most_px: float) -> Settled:
-        """A step by the frame's own derivatives, of patches that are warped; its gradient is that of the place where steps end.
+    def step(self, level: Tensor, place: Tensor, around: Tensor, warp: Tensor) -> Tensor:
+        """Places (B, N, 2) px after a step by the templates' derivatives; patches (B, N, P, 2) px are warped by (B, N, 2, 2)."""
+        fit = self.fit(self.sample(level, place[:, :, None] + around))
+        return place - (warp @ fit[..., :2, None])[..., 0] / fit[..., 2:3].clamp_min(self.least_left)
+
+    def settle(self, level: Tensor, place: Tensor, around: Tensor, most_px: float) -> Settled:
+        """A step by the frame's own derivatives, of patches (B, N, P, 2) px; its gradient is that of the place where steps end.
 
         Where the shares of the derivatives are zero, their change by the frame is their change by the place, times minus one, times
         the motion (implicit function theorem).
         """
-        values, along_x, along_y = self.sample_warped(level, place, warp)
+        places = place[:, :, None] + around
+        values = self.sample(level, places)
         fit = self.fit(values)
-        by_place = torch.stack((self.fit(along_x.detach())[..., :2], self.fit(along_y.detach())[..., :2]), -1)  # (B, N, 2, 2)
+        along = self.difference_px * torch.eye(2, dtype=place.dtype, device=place.device)
+        ahead = [self.fit(self.sample(level.detach(), places.detach() + one))[..., :2] for one in along]
+        by_place = (torch.stack(ahead, -1) - fit.detach()[..., :2, None]) / self.difference_px  # (B, N, 2, 2)
         determinant = by_place[..., 0, 0] * by_place[..., 1, 1] - by_place[..., 0, 1] * by_place[..., 1, 0]
         squares, explained = self.residual(values.detach(), fit.detach())
         there = (fit[..., 2] > self.least_left) & (explained > self.least_explained) & (determinant > 0.1 * self.least_left**2)
@@ -122,62 +152,52 @@ class DotTemplates(nn.Module):
 
     def residual(self, values: Tensor, fit: Tensor) -> tuple[Tensor, Tensor]:
         """Weighted squares (B, N) of what patches (B, N, P) hold beside the fit, and the share (B, N) that the dot explains."""
-        without_dot = values - (self.columns[..., 3:6] @ fit[..., 3:6, None])[..., 0]
+        without_dot = values - (self.columns[..., 3:9] @ fit[..., 3:9, None])[..., 0]
         missed = (values - (self.columns @ fit[..., None])[..., 0]).square()
         squares = (self.weight * missed).sum(-1)
         return squares, 1.0 - squares / (self.weight * without_dot.square()).sum(-1).clamp_min(1e-12)
 
     def fit(self, values: Tensor) -> Tensor:
-        """Shares of the columns (B, N, 10) in patches (B, N, P)."""
+        """Shares of the columns (B, N, 16) in patches (B, N, P)."""
         return (self.matrix @ values[..., None])[..., 0]
 
-    def sample(self, level: Tensor, place: Tensor) -> Tensor:
-        """Patches (B, N, P) of a level around places (B, N, 2) px, through a cubic B-spline: all lie alike between pixels."""
-        whole, t = self._split(place)
-        window = torch.arange(-self.reach - 1, self.reach + 3, device=level.device)
-        block = self._pixels(level, whole[..., 0:1] + window, whole[..., 1:2] + window)  # (B, N, S + 3, S + 3)
-        return _along(_along(block, _spline(t[..., 1]), 2), _spline(t[..., 0]), 3).flatten(2)
+    def slopes(self, level: Tensor, places: Tensor) -> Tensor:
+        """Slopes (B, N, P, 2) of a level at places (B, N, P, 2), by px."""
+        along = self.difference_px * torch.eye(2, dtype=places.dtype, device=places.device)
+        changes = [self.sample(level, places + one) - self.sample(level, places - one) for one in along]
+        return torch.stack(changes, -1) / (2.0 * self.difference_px)
 
-    def sample_warped(self, level: Tensor, place: Tensor, warp: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Patches (B, N, P) that are warped by (B, N, 2, 2), and their slopes along x and y, by px."""
-        whole, t = self._split(place[:, :, None] + (warp @ self.patch.t()).mT)
-        window = torch.arange(-1, 3, device=level.device)
-        block = self._pixels(level, whole[..., 0:1] + window, whole[..., 1:2] + window)  # (B, N, P, 4, 4)
-        across, down = _spline(t[..., 0])[..., None, :], _spline(t[..., 1])
-        rows = (block * across).sum(-1)
-        along_x = ((block * _spline_slope(t[..., 0])[..., None, :]).sum(-1) * down).sum(-1)
-        along_y = (rows * _spline_slope(t[..., 1])).sum(-1)
-        return (rows * down).sum(-1), along_x / float(self.cell), along_y / float(self.cell)
+    def sample(self, level: Tensor, places: Tensor) -> Tensor:
+        """A level (B, 1, h, w) at places (B, N, P, 2) px, through a cubic B-spline: four bilinear samples with its weights.
 
-    def _split(self, place: Tensor) -> tuple[Tensor, Tensor]:
-        """Whole pixels of the level, and what is left, of places in px."""
-        at = ((place + 0.5) / float(self.cell) - 0.5).clamp(-1e4, 1e5)
+        Source:
+            Sigg and Hadwiger, Fast third-order texture filtering, GPU Gems 2, 2005, chapter 20.
+        """
+        at = self.in_cells(places)
         whole = at.detach().floor()
-        return whole.long(), at - whole
+        t = at - whole
+        s = 1.0 - t
+        first, last = s * s * s / 6.0, t * t * t / 6.0
+        far = 2.0 / 3.0 - s * s * (1.0 - 0.5 * s) + last  # weight of the pixels beyond; that of the others is the rest
+        near = 1.0 - far
+        before, apart = whole - first / near, 1.0 + last / far + first / near
+        corners = self.corners[:, None, None]
+        light = self.read(level, (before[:, None] + apart[:, None] * corners).flatten(1, 2))  # (B, 4 N, P)
+        weight = near[:, None] + (far - near)[:, None] * corners
+        return (light.reshape(weight.shape[:-1]) * weight[..., 0] * weight[..., 1]).sum(1)
 
-    def _pixels(self, level: Tensor, columns: Tensor, rows: Tensor) -> Tensor:
-        """Pixels (B, ..., R, C) of a level at rows (B, ..., R) and columns (B, ..., C)."""
-        height, width = level.shape[2], level.shape[3]
-        index = rows.clamp(0, height - 1)[..., None] * width + columns.clamp(0, width - 1)[..., None, :]
-        return level.flatten(1).gather(1, index.flatten(1)).reshape(index.shape)
+    def in_cells(self, places: Tensor) -> Tensor:
+        """Places of the image in pixels of the level."""
+        return places if self.cell == 1 else (places + 0.5) / float(self.cell) - 0.5
 
-
-def _along(block: Tensor, weights: Tensor, dim: int) -> Tensor:
-    """Weighted sums (B, N, ., .) of four neighbours along a dimension, weights (B, N, 4)."""
-    size = block.shape[dim] - 3
-    total = block.narrow(dim, 0, size) * weights[..., 0, None, None]
-    for k in range(1, 4):
-        total = total + block.narrow(dim, k, size) * weights[..., k, None, None]
-    return total
-
-
-def _spline(t: Tensor) -> Tensor:
-    """Weights of the four neighbours by a cubic B-spline, (..., 4)."""
-    s = 1.0 - t
-    return torch.stack((s**3, 3.0 * t**3 - 6.0 * t**2 + 4.0, 3.0 * s**3 - 6.0 * s**2 + 4.0, t**3), -1) / 6.0
+    def read(self, level: Tensor, at: Tensor) -> Tensor:
+        """A level (B, 1, h, w) at places (B, M, P, 2) in its pixels, linear between them: (B, M, P)."""
+        scale = 2.0 / torch.tensor([level.shape[3] - 1.0, level.shape[2] - 1.0], dtype=at.dtype, device=at.device)
+        image = level.expand(at.shape[0], -1, -1, -1)
+        return nn.functional.grid_sample(image, at * scale - 1.0, "bilinear", "border", align_corners=True)[:, 0]
 
 
-def _spline_slope(t: Tensor) -> Tensor:
-    """Their slopes by the place."""
-    s = 1.0 - t
-    return torch.stack((-(s**2), 3.0 * t**2 - 4.0 * t, 4.0 * s - 3.0 * s**2, t**2), -1) / 2.0
+def quadratic(places: Tensor) -> Tensor:
+    """Halves of squares and the product of places (..., 2): (..., 3), the terms of a bend."""
+    x, y = places[..., 0], places[..., 1]
+    return torch.stack((0.5 * x * x, x * y, 0.5 * y * y), -1)

@@ -21,8 +21,8 @@ from ..core.checks import (
 from ..core.geometry import gradient_of_depth
 from ..model.calibration import Calibration, check_calibration
 from ..model.markers import find_dots
-from .dot_motion import DotMotion
-from .dots import DotTemplates
+from .dot_motion import DotMotion, matern
+from .dots import DotTemplates, quadratic
 
 PEDESTAL = 0.25
 """Added to the light before its logarithm: dark pixels are all noise in a ratio."""
@@ -36,11 +36,14 @@ COARSE_PATCH = 0.55
 FEWEST = 8
 """Dots that a skin has at least; fewer are dust."""
 
-NEIGHBOURS = 24
-"""A dot's neighbours: the two rings around it."""
+REACH = 0.8
+"""Of the dots around a dot, in spacings."""
 
-REACH = 1.2
-"""Of a neighbour's say, in spacings."""
+LEAST_AROUND = 0.03
+"""A dot's neighbours have so much of a Gaussian of this reach: the two rings around it."""
+
+KNOWN = 0.3
+"""Variance of a place that others tell, in units of the process."""
 
 AGREES = 0.3
 """A dot that differs by so many spacings from what its neighbours expect is another."""
@@ -48,11 +51,17 @@ AGREES = 0.3
 ROUNDS = 12
 """Rings of dots that are found one after another where there is no frame before."""
 
-STEPS = 5
-"""By the templates' derivatives, at each level; then a frame's own derivatives settle the place in three."""
+LENGTH = 2.2
+"""Of the Gaussian process of motion, in spacings."""
 
-BEND = 0.1
-"""Error of a dot whose skin bends, in units of how far its neighbours miss it times the square of diameter over spacing."""
+NUGGET = 1e-4
+"""Its noise, in units of its variance."""
+
+BEND_SHARE = 0.33
+"""Skin bends more smoothly within a dot than the process (Matern 5/2) says: standard deviation, measured in units of it."""
+
+FLOOR_PX = 0.003
+"""Error of a place beside noise and bends: what drawn dots under a contact's shading are off without noise."""
 
 NEAREST_CAMERA_MM = 20.0
 """Height of a camera above the skin where none is known, at least."""
@@ -65,9 +74,10 @@ class SkinMotion(nn.Module):
     """Motion of the printed dots of a skin: images (B, 3, H, W) and their depth to a :class:`DotMotion`.
 
     A dot is looked for where the frame before had it. Without one, the dots that have hardly moved are found first, then, ring by
-    ring, each near where its neighbours expect it; what is not joined to most of the dots in this way is not seen. Frames of a
-    batch do not influence one another, and nothing is remembered between calls. Displacements are differentiable in the images
-    and in depth.
+    ring, each near where the others expect it (a Gaussian process); what is not joined to most of the dots in this way is not seen.
+    The process bends the patches, too: a dot tells the mean motion of its rim, which is not that of its middle where skin bends.
+    Frames of a batch do not influence one another, and nothing is remembered between calls. Displacements are differentiable in the
+    images and in depth.
 
     Args:
         background: (3, H, W) in [0, 1], the skin at rest with its dots, as the camera gives it.
@@ -85,9 +95,13 @@ class SkinMotion(nn.Module):
 
     rest_px: Tensor
     camera: Tensor
-    index: Tensor
-    offset: Tensor
-    reach: Tensor
+    around: Tensor
+    beside: Tensor
+    terms: Tensor
+    alike: Tensor
+    slopes: Tensor
+    by_bend: Tensor
+    prior: Tensor
 
     def __init__(
         self,
@@ -100,10 +114,8 @@ class SkinMotion(nn.Module):
         super().__init__()
         check_field("background", background)
         check_range("background", background)
-        self.diameter_px, self.mm_per_pixel = (
-            check_positive("diameter_px", diameter_px),
-            check_positive("mm_per_pixel", mm_per_pixel),
-        )
+        self.diameter_px = check_positive("diameter_px", diameter_px)
+        self.mm_per_pixel = check_positive("mm_per_pixel", mm_per_pixel)
         self.height, self.width = background.shape[1], background.shape[2]
         check_float_tensor("dots_px", dots_px)
         if dots_px.dim() != 2 or dots_px.shape[1] != 2 or not bool(torch.isfinite(dots_px).all()):
@@ -116,22 +128,21 @@ class SkinMotion(nn.Module):
                 f"background: expected a skin with at least {FEWEST} printed dots that lie wholly in view, got {len(dots)}: a skin "
                 "without dots shows no motion that could be told from a change of light"
             )
-        distance = torch.cdist(dots, dots).fill_diagonal_(math.inf)
-        self.spacing_px = float(distance.amin(dim=1).median())
-        near, index = distance.topk(min(NEIGHBOURS, len(dots) - 1), largest=False)
-        apart = (dots[index] - dots[:, None]) / self.spacing_px
+        distance = torch.cdist(dots, dots)
+        self.spacing_px = float(distance.topk(2, largest=False).values[:, 1].median())
         self.knows_camera = camera_mm is not None
         x, y, height = (0.0, 0.0, math.inf) if camera_mm is None else check_camera(camera_mm)
-        self.agrees, self.rounds, self.steps, self.settles, self.nearest_mm = AGREES, ROUNDS, STEPS, 2, NEAREST_CAMERA_MM
-        self.bend, self.pedestal, self.depth_share, self.depth_mm = BEND, PEDESTAL, DEPTH_SHARE, DEPTH_MM
+        self.agrees_px, self.rounds, self.most_px = AGREES * self.spacing_px, ROUNDS, 0.3 * self.diameter_px
+        self.nearest_mm, self.pedestal, self.depth_share, self.depth_mm = NEAREST_CAMERA_MM, PEDESTAL, DEPTH_SHARE, DEPTH_MM
+        self.nugget, self.known, self.least_around = NUGGET, KNOWN, LEAST_AROUND
+        self.bend_share, self.floor_px = BEND_SHARE, FLOOR_PX
         for name, value in (
             ("rest_px", dots),
             ("camera", torch.tensor([x, y, 1.0 / height], dtype=torch.float64)),
-            ("index", index),
-            ("offset", torch.cat((torch.ones_like(apart[..., :1]), apart), dim=-1)),  # (N, K, 3)
-            ("reach", torch.exp(-0.5 * (near / (REACH * self.spacing_px)).square())),
+            ("around", torch.exp(-0.5 * (distance / (REACH * self.spacing_px)).square())),
+            ("beside", distance < 1.6 * self.spacing_px),
         ):
-            self.register_buffer(name, value if value.dtype == torch.long else value.to(background.dtype))
+            self.register_buffer(name, value if value.dtype == torch.bool else value.to(background.dtype))
         grey = self.log_light(background[None])
         half = min(PATCH * self.diameter_px, 0.5 * self.spacing_px)
         self.rim_px = 0.8 * half
@@ -139,6 +150,23 @@ class SkinMotion(nn.Module):
         cell = max(1, int(blur_px / 2.0))
         self.coarse = DotTemplates(grey, dots, COARSE_PATCH * self.spacing_px, cell, blur_px)
         self.fine = DotTemplates(grey, dots, half, max(1, int(self.diameter_px / 10.0)), 0.1 * self.diameter_px)
+        self.register_buffer("terms", torch.cat((self.fine.patch, quadratic(self.fine.patch)), dim=-1))
+        # the process: how alike dots move, derivatives of this, and what bends do to places
+        length = LENGTH * self.spacing_px
+        far = (dots[:, None] - dots).double() / length
+        r = math.sqrt(5.0) * far.norm(dim=-1, keepdim=True)
+        bends = torch.stack((far[..., 0] ** 2, far[..., 0] * far[..., 1], far[..., 1] ** 2), -1)
+        bends = ((1.0 + r) * torch.tensor([1.0, 0.0, 1.0], dtype=torch.float64) - 5.0 * bends) / length
+        slopes = torch.cat(((1.0 + r) * far, bends), -1) * torch.exp(-r) * (-5.0 / (3.0 * length))
+        prior = torch.tensor([[3, 0, 1], [0, 1, 0], [1, 0, 3]], dtype=torch.float64) * (25.0 / 3.0 / length**4)  # of bends
+        by_bend = self.fine.by_bend.double()
+        for name, value in (
+            ("alike", matern(far.norm(dim=-1))),
+            ("slopes", slopes.mT),
+            ("by_bend", torch.einsum("nkjq,nmq->nkjm", by_bend, slopes[..., 2:]).flatten(1, 2)),
+            ("prior", torch.einsum("nkjq,qr,nljr->nkl", by_bend, prior, by_bend)),
+        ):
+            self.register_buffer(name, value.to(background.dtype))
 
     @classmethod
     def from_calibration(cls, calibration: Calibration, camera_mm: tuple[float, float, float] | None = None) -> "SkinMotion":
@@ -203,12 +231,20 @@ class SkinMotion(nn.Module):
         grey = self.log_light(images)
         coarse, fine = self.coarse.prepare(grey.detach()), self.fine.prepare(grey)
         place, seen = self.find(coarse, fine.detach(), last)
-        warp = self.warp(place, seen)
-        most_px = 0.3 * self.diameter_px
-        for _ in range(self.settles):
-            place = self.fine.settle(fine.detach(), place, warp, most_px).place
-        settled = self.fine.settle(fine, place, warp, most_px)
-        return self.in_mm(settled.place, settled.covariance + self.doubt(place, seen), seen & settled.there, depth_mm)
+        same = torch.eye(2, dtype=place.dtype, device=place.device)
+        place = torch.where(seen[..., None], self.fine.step(fine.detach(), place, self.fine.patch, same), place)
+        around, warp, beside = self.surroundings(place, seen)
+        for _ in range(2):
+            place = torch.where(seen[..., None], self.fine.step(fine.detach(), place, around, warp), place)
+        settled = self.fine.settle(fine, place, around, self.most_px)
+        place = settled.place
+        if place.requires_grad:  # a dot that moves bends the skin in others
+            shares = self.process(place - self.rest_px, seen)[0]
+            by_bend = self.by_bend.reshape(-1, 2, 2, place.shape[1])
+            bends = torch.einsum("nkjm,bmj->bnk", by_bend, shares - shares.detach())
+            place = place - (warp @ bends[..., None])[..., 0]
+        noise = (settled.covariance + self.floor_px**2 * same) * seen[..., None, None].to(place.dtype)
+        return self.in_mm(place, noise + beside, seen & settled.there, depth_mm)
 
     def log_light(self, images: Tensor) -> Tensor:
         """(B, 1, H, W): mean of the channels' logarithms, in which light from opposite sides cancels."""
@@ -220,25 +256,31 @@ class SkinMotion(nn.Module):
         start = self.rest_px[None].expand(count, -1, -1) if last is None else self.px_of(last.displacement_mm.detach())
         start = start.expand(count, -1, -1)
         place, seen = self.register(coarse, fine, start)
-        seen = self.joined(place, seen) if last is None else self.consistent(place, start, seen)
+        if last is None:
+            seen = self.joined(place, seen)
+        seen = self.consistent(place, start, seen)
+        if last is None:  # without those that what contradicted them joined to others
+            seen = self.joined(place, seen)
         for _ in range(self.rounds if last is None else 1):
-            expected, support = self.expected(place, start, seen)
-            wanted = ~seen & (support > 1.0) & self.in_view(expected)
+            expected, variance = self.expected(place, start, seen)
+            wanted = ~seen & (variance < self.known) & self.in_view(expected)
             if not bool(wanted.any()):
                 break
             tried, there = self.register(coarse, fine, expected)
-            near = (tried - expected).square().sum(-1).sqrt() < self.agrees * self.spacing_px
+            near = (tried - expected).square().sum(-1).sqrt() < self.agrees_px * (1.0 - variance / self.known)  # else next round
             gained = wanted & there & near
             if not bool(gained.any()):
                 break
             place = torch.where(gained[..., None], tried, place)
             seen = self.consistent(place, start, seen | gained)
+            if last is None:
+                seen = self.joined(place, seen)
         return torch.where(seen[..., None], place, self.expected(place, start, seen)[0]), seen
 
     def register(self, coarse: Tensor, fine: Tensor, start: Tensor) -> tuple[Tensor, Tensor]:
         """Places of dots (B, N, 2) px from a start, and whether they are there."""
-        place, _ = self.coarse.follow(coarse, start, self.steps, 0.35 * self.spacing_px)
-        place, there = self.fine.follow(fine, place, self.steps, 0.3 * self.diameter_px)
+        place, _ = self.coarse.search(coarse, start, 0.35 * self.spacing_px)
+        place, there = self.fine.search(fine, place, self.most_px)
         return place, there & self.in_view(place)
 
     def in_view(self, place: Tensor) -> Tensor:
@@ -246,65 +288,75 @@ class SkinMotion(nn.Module):
         x, y, rim = place[..., 0], place[..., 1], self.rim_px
         return (x > rim) & (y > rim) & (x < float(self.width) - 1.0 - rim) & (y < float(self.height) - 1.0 - rim)
 
+    def process(self, moved: Tensor, seen: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """The Gaussian process through motions (B, N, 2) of seen dots.
+
+        Returns:
+            The shares of dots in its mean, (B, N, 2), its inverse covariance, (B, N, N), in units of its variance, and this
+            variance around each dot, (B, N): that with which others miss the dots there, as large as it should be.
+        Source:
+            Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, eq. 2.25 and 5.12 (leave one out).
+        """
+        known = seen.to(moved.dtype)
+        system = self.alike * known[:, :, None] * known[:, None] + torch.diag_embed(self.nugget + 1.0 - known)
+        inverse = torch.cholesky_inverse(torch.linalg.cholesky(system))
+        shares = inverse @ (moved * known[..., None])
+        missed = 0.5 * shares.square().sum(-1) / inverse.diagonal(dim1=1, dim2=2)
+        return shares, inverse, (self.around @ missed[..., None])[..., 0] / (self.around @ known[..., None])[..., 0].clamp_min(1e-3)
+
     def expected(self, place: Tensor, start: Tensor, seen: Tensor) -> tuple[Tensor, Tensor]:
-        """Places (B, N, 2) px where the motion of seen neighbours from a start expects dots, and how many these are, (B, N)."""
-        plane, support = self.plane(place - start, seen, 0.0)
-        return start + plane[..., 0, :], support
+        """Places (B, N, 2) px where the motion of other dots from a start expects dots, and the variance (B, N) in units of all."""
+        moved = place - start
+        shares, inverse, _ = self.process(moved, seen)
+        left_out = 1.0 / inverse.diagonal(dim1=1, dim2=2)
+        alike = self.alike * seen.to(place.dtype)[:, None]
+        mean = torch.where(seen[..., None], moved - shares * left_out[..., None], alike @ shares)
+        return start + mean, torch.where(seen, left_out, 1.0 - ((alike @ inverse) * alike).sum(-1))
 
-    def warp(self, place: Tensor, seen: Tensor) -> Tensor:
-        """(B, N, 2, 2): what the motion makes of the skin around each dot."""
-        plane, _ = self.plane(place - self.rest_px, seen, 1.0)
+    def surroundings(self, place: Tensor, seen: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Patches (B, N, P, 2) px as the process bends them, their warp (B, N, 2, 2), and a covariance (B, N, 2, 2) px^2.
+
+        This is of a seen dot what is not known of its bend, of another what is not known of its place.
+        """
+        shares, inverse, variance = self.process(place - self.rest_px, seen)
+        slopes = self.slopes @ shares[:, None]  # (B, N, 5, 2)
+        slopes = torch.cat((slopes[..., :2, :].clamp(-0.6, 0.6), slopes[..., 2:, :]), -2)
+        around = self.fine.patch + self.terms @ slopes
+        known = seen.to(place.dtype)
+        bend = (self.by_bend * known[:, None, None]).flatten(1, 2)  # (B, 4 N, N): of both axes by bends along both
+        half = (bend @ inverse).reshape(len(place), -1, 2, 2, place.shape[1])
+        told = half.flatten(3) @ bend.reshape(half.shape).flatten(3).mT
+        unknown = 1.0 - ((self.alike * known[:, None] @ inverse) * self.alike).sum(-1)
         same = torch.eye(2, dtype=place.dtype, device=place.device)
-        return same + (plane[..., 1:, :].mT / self.spacing_px).clamp(-0.6, 0.6)
-
-    def plane(self, moved: Tensor, seen: Tensor, own: float) -> tuple[Tensor, Tensor]:
-        """Plane (B, N, 3, 2) through the motions (B, N, 2) of seen neighbours, by spacings, and how many these are, (B, N)."""
-        around = moved[:, self.index]  # (B, N, K, 2)
-        weight = self.reach * seen[:, self.index].to(moved.dtype)
-        columns = weight[..., None] * self.offset
-        known = own * seen.to(moved.dtype)[..., None]
-        ridge = torch.tensor([1e-6, 0.02, 0.02], dtype=moved.dtype, device=moved.device)
-        ridge = ridge + known * torch.tensor([1.0, 0.0, 0.0], dtype=moved.dtype, device=moved.device)
-        right = columns.mT @ around
-        right = torch.cat((right[..., :1, :] + (known * moved)[..., None, :], right[..., 1:, :]), dim=-2)
-        return torch.linalg.solve(columns.mT @ self.offset + torch.diag_embed(ridge), right), weight.sum(-1)
-
-    def doubt(self, place: Tensor, seen: Tensor) -> Tensor:
-        """Covariance (B, N, 2, 2) px^2 beside noise: of a seen dot what its bend hides, of another how its neighbours may err."""
-        expected, support = self.expected(place, self.rest_px[None].expand_as(place), seen)
-        miss = (place - expected).square().sum(-1)
-        bend = (self.bend * self.diameter_px**2 / self.spacing_px**2) ** 2 * miss
-        known = seen.to(place.dtype) * (support > 1.0).to(place.dtype)
-        usual = (miss * known).sum(-1, keepdim=True) / known.sum(-1, keepdim=True).clamp_min(1.0)
-        unknown = torch.where(support > 1.0, usual + (0.1 * self.spacing_px) ** 2, self.spacing_px**2)
-        return torch.diag_embed(torch.where(seen, bend, unknown)[..., None].expand(-1, -1, 2))
+        return (
+            around,
+            same + slopes[..., :2, :].mT,
+            variance[..., None, None]
+            * torch.where(seen[..., None, None], self.bend_share**2 * (self.prior - told), unknown[..., None, None] * same),
+        )
 
     def consistent(self, place: Tensor, start: Tensor, seen: Tensor) -> Tensor:
         """Seen dots without those that contradict their neighbours or share a place with a better one, the worst first."""
         miss = torch.zeros_like(place[..., 0])
         for _ in range(self.rounds):
-            expected, support = self.expected(place, start, seen)
-            miss = (place - expected).square().sum(-1).sqrt() * (seen & (support > 1.0)).to(place.dtype)
-            worst = miss >= miss[:, self.index].amax(-1)
-            worst = worst & (miss > self.agrees * self.spacing_px)
+            expected, variance = self.expected(place, start, seen)
+            miss = (place - expected).square().sum(-1).sqrt() * (seen & (variance < self.known)).to(place.dtype)
+            worst = (miss > self.agrees_px) & (miss >= (miss[:, None] * self.around.gt(self.least_around)).amax(-1))
             if not bool(worst.any()):
                 break
             seen = seen & ~worst
         apart = torch.cdist(place, place) + self.spacing_px * torch.eye(place.shape[1], dtype=place.dtype, device=place.device)
-        other = (apart < self.agrees * self.spacing_px) & seen[:, None] & (miss[:, None] <= miss[:, :, None])
+        other = (apart < self.agrees_px) & seen[:, None] & (miss[:, None] <= miss[:, :, None])
         return seen & ~other.any(-1)
 
     def joined(self, place: Tensor, seen: Tensor) -> Tensor:
         """Seen dots that neighbours which agree with them join to most of the others."""
         moved = place - self.rest_px
-        agree = (moved[:, self.index] - moved[:, :, None]).square().sum(-1).sqrt() < 1.5 * self.agrees * self.spacing_px
-        beside = self.offset[..., 1:].square().sum(-1) < 1.6**2
-        agree = agree & beside & seen[:, self.index] & seen[..., None]
-        own = torch.arange(1, place.shape[1] + 1, device=place.device).expand(place.shape[0], -1)
-        label = torch.where(seen, own, 0)
+        agree = (torch.cdist(moved, moved) < 1.5 * self.agrees_px) & self.beside & seen[:, None] & seen[:, :, None]
+        label = torch.where(seen, torch.arange(1, place.shape[1] + 1, device=place.device), 0)
         for _ in range(place.shape[1]):
             before = label
-            label = torch.maximum(label, torch.where(agree, label[:, self.index], 0).amax(-1))
+            label = torch.maximum(label, torch.where(agree, label[:, None], 0).amax(-1))
             if bool((label == before).all()):
                 break
         sizes = torch.zeros_like(place[..., 0]).scatter_add(1, (label - 1).clamp_min(0), seen.to(place.dtype))

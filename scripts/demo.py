@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from matplotlib.colors import LightSource
 from PIL import Image
 from tqdm import tqdm
@@ -37,6 +38,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--frames", type=int, default=20, metavar="N", help="of the film (20)")
     arguments = parser.parse_args(argv)
     arguments.out.mkdir(parents=True, exist_ok=True)
+    torch.set_num_threads(1)  # many small tensors: a second thread waits for a core where another process runs
     unit, start = drawn_sensor(SEED), time.perf_counter()
     presses = [vts.Press(ball.image, ball.ball_diameter_mm) for ball in unit.balls[:BALLS]]
     calibration = vts.calibrate(unit.background, unit.sensor, presses=presses)

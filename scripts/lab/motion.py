@@ -263,7 +263,8 @@ def off_depth(depth: Tensor, seed: int) -> Tensor:
     draw = torch.Generator().manual_seed(seed)
     height, width = depth.shape[2:]
     error = blur(torch.randn(1, 1, height + 120, width + 120, generator=draw), gaussian_weights(20.0))[..., 60:-60, 60:-60]
-    return depth + (DEPTH_SHARE * depth).hypot(torch.tensor(DEPTH_MM)) * error * (40.0 * np.pi**0.5)
+    off: Tensor = (DEPTH_SHARE * depth).hypot(torch.tensor(DEPTH_MM)) * error * (40.0 * np.pi**0.5)
+    return depth + off
 
 
 def run_fields(seeds: int) -> Iterator[tuple[str, str, Row]]:

@@ -80,7 +80,8 @@ def _weigh(contacts: list[Contact], prior: SensorPrior | None, half_mm: float) -
             doubted = abs(float(far[k])) > DOUBTED
             contact.doubt = _wrong_diameter(contact, float(gains[k]), len(left) - 1, prior is not None) if doubted else ""
         own = evidence.gains([found] * len(left)).clamp_min(1e-3).tolist()
-        if not _reject_slopes(left, evidence.errors_deg([found / gain for gain in own]), prior is not None):
+        scaled = evidence.errors_deg([found / gain for gain in own])
+        if not _reject_slopes(left, list(map(min, errors, scaled)), prior is not None):
             return
 
 

@@ -234,7 +234,7 @@ def by_calibration(training: Training, mode: str, prior: bool = True) -> Built:
     notes = ["calibrate chose point lights"] * (training.calibration.response is None)
     if training.sensor.prior is not None:
         notes.append(f"prior fitted on {training.sensor.prior.source or 'a unit that it does not name'}")
-    used = len(training.located) if training.presses else 0
+    used = sum(row["used"] for row in training.calibration.report.get("presses", []))
     return pipeline(training.calibration, mode)._replace(note="; ".join(notes), used=used)
 
 

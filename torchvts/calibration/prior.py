@@ -16,7 +16,7 @@ from .contacts import Contact, used
 from .doubts import CalibrationWarning
 from .field import Family, power_of
 from .given_images import sort_presses
-from .posterior import Evidence, Prior, mean_error_deg, weights_of
+from .posterior import Evidence, Prior, mean_error_deg
 from .press_model import by_presses
 from .presses import Press, check_presses
 from .response_fit import FEW, fit_depth_brightness
@@ -101,7 +101,7 @@ def _pooled(balls: Sequence[Sequence[Contact]], half_mm: float) -> ResponseField
     """The field of several units, each of which counts alike."""
     family = Family(*PRIOR_DEGREES, half_mm)
     evidence = Evidence(family, [contact for own in balls for contact in own])
-    weights = torch.cat([weights_of(own) / weights_of(own).sum() for own in balls]) / len(balls)
+    weights = torch.tensor([1.0 / len(own) / len(balls) for own in balls for _ in own], dtype=torch.float64)
     power = sum(power_of(own) for own in balls) / len(balls)
     prior = Prior(torch.zeros(2, family.size(), dtype=torch.float64), RIDGE * family.penalty(power))
     return evidence.posterior(prior, weights).field

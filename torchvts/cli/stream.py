@@ -26,6 +26,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_source(parser)
     parser.add_argument("--save-calibration", type=Path, metavar="FILE", help="write the calibration, .safetensors")
     parser.add_argument("--out", type=Path, metavar="FOLDER", help="for overlay video, sheet.png, frames.csv and summary.json")
+    parser.add_argument(
+        "--motion", action="store_true", help="of a skin with printed dots: shift, turn and stuck share of the object"
+    )
     add_video(parser)
 
 
@@ -43,7 +46,8 @@ def run(arguments: argparse.Namespace) -> int:
         if arguments.save_calibration is not None:
             stream.calibration.save(arguments.save_calibration)
             print(f"wrote {arguments.save_calibration}")
-        report, sheet = StreamReport(stream), Sheet(stream.calibration.sensor.mm_per_pixel, stream.metric)
+        report = StreamReport(stream, arguments.motion)
+        sheet = Sheet(stream.calibration.sensor.mm_per_pixel, stream.metric)
         video = None
         if arguments.out is not None and arguments.video != "none":
             video = stack.enter_context(VideoFile(arguments.out / f"overlay.{arguments.video}", stream.fps))

@@ -11,7 +11,7 @@ setup: $(VENV)/.done
 # A file that cannot be compiled is none that is imported.
 $(VENV)/.done: pyproject.toml constraints.txt hatch_build.py $(wildcard torchvts/compiled/csrc/*.[ch])
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/pip install --quiet --disable-pip-version-check --no-compile --constraint constraints.txt --editable ".[pose,onnx,view,test,docs]"
+	$(BIN)/pip install --quiet --disable-pip-version-check --no-compile --constraint constraints.txt --editable ".[pose,onnx,view,containers,test,docs]"
 	$(BIN)/python -m compileall -qq -j 0 -x 'testing/_internal|/tests/|/plotly/' $(VENV)/lib/python3*/site-packages torchvts || true
 	touch $@
 

@@ -170,10 +170,12 @@ def _of_mcap(path: Path) -> Films:
     films: dict[str, Film] = {}
     with path.open("rb") as stream:
         summary = make_reader(stream).get_summary()
-        for channel in summary.channels.values() if summary else ():
-            if channel.schema_id in summary.schemas and summary.schemas[channel.schema_id].name in ROS_IMAGES:
-                count = summary.statistics.channel_message_counts.get(channel.id, 0) if summary.statistics else 0
-                films[channel.topic] = Film(count, partial(reads, channel.topic))
+    if summary is None:
+        return films
+    counts = summary.statistics.channel_message_counts if summary.statistics else {}
+    for channel in summary.channels.values():
+        if channel.schema_id in summary.schemas and summary.schemas[channel.schema_id].name in ROS_IMAGES:
+            films[channel.topic] = Film(counts.get(channel.id, 0), partial(reads, channel.topic))
     return films
 
 
@@ -267,7 +269,7 @@ def open_film(path: Path) -> Film | None:
         film = films[chosen[0]]
         return film._replace(reads=lambda: _decoded(film, container.kind, path))
     if not films:
-        raise ValueError(f"{place}: {container.kind} without images in colour")
+        raise ValueError(f"{place}: {container.kind} without images in colour: expected frames (T, H, W, 3), R, G, B")
     named = ", ".join(str(place / name) for name in (chosen or films))
     raise ValueError(f"{path}: expected the path of one recording in {container.kind}, got {len(chosen)}: one of {named}")
 

@@ -36,7 +36,8 @@ class StreamReport:
     Args:
         stream: whose frames are added.
         motion: also how the object moves that drags the skin, by its printed dots (:class:`torchvts.SkinMotion`): its shift, its
-            turn, and the share of the contact that sticks. It costs about as much time as depth.
+            turn, and the share of the contact that sticks. The time grows with the dots:
+            230 take a second a frame.
     Raises:
         ValueError: ``motion`` of a skin without dots.
     """
@@ -64,7 +65,8 @@ class StreamReport:
         light, unseen = light_levels(conditions)[0].tolist(), float(conditions.unseen_deg)
         self.rows.append((frame.number, frame.time_s, area, deepest, light, unseen, doubt))
         if self._follow is not None:
-            self._of_object.append(self._object(self._follow, frame))
+            with self.stream.stages.stage("motion"):
+                self._of_object.append(self._object(self._follow, frame))
         dropped = f", {self.stream.dropped} dropped" if self.stream.dropped else ""
         times = [f"{name} {ms:.1f}" for name, ms in self.stream.stages.last.items()]
         half = (len(times) + 1) // 2
@@ -115,6 +117,9 @@ class StreamReport:
         lines.append("median ms: " + ", ".join(f"{name} {ms:.1f}" for name, ms in values["stages_ms"].items()))
         unit = "mm" if values["metric"] else "(not in mm)"
         lines.append(f"contact in {values['contact_frames']} frames, deepest {values['deepest_mm']:.3f} {unit}")
+        if moved := [row for row in self._of_object if not math.isnan(row[0])]:
+            shift, turn = max(math.hypot(*row[:2]) for row in moved), max(abs(row[2]) for row in moved)
+            lines.append(f"the object moved the skin in {len(moved)} frames, by at most {shift:.3f} {unit} and {turn:.1f} degrees")
         if values["light_level"]:
             lines.append("light at the end, R G B: " + " ".join(f"{v:.3f}" for v in values["light_level"]) + " of the background's")
         if values["doubted_frames"]:

@@ -1,11 +1,13 @@
 """The first minute: a drawn sensor is calibrated by presses of a ball, and a key that rolls and shears over it becomes depth.
 
-Writes film.webp (the camera's frames beside their depth) and press.png (its deepest frame), and prints how far depth is off.
+Writes film.webp (the camera's frames beside their depth) and press.png (its deepest frame), and prints how far depth is off. Where
+the folder of real images is there (TORCHVTS_DATA, else ../shared/data), real.png is a ball on a GelSight Mini, by the shipped prior.
 
 python scripts/demo.py [--out out/demo]
 """
 
 import math
+import os
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -60,7 +62,21 @@ def main(argv: Sequence[str] | None = None) -> int:
     print(calibration)
     print(f"{len(film)} frames, {frame_ms:.1f} ms each; deepest {most_mm:.2f} mm, off by {rms_um:.0f} um RMS")
     print(f"film.webp and press.png in {arguments.out}, after {time.perf_counter() - start:.0f} s")
+    folder = Path(os.environ.get("TORCHVTS_DATA", "../shared/data")) / "gelsight_mini_a"
+    if folder.is_dir():
+        real(folder, arguments.out / "real.png")
     return 0
+
+
+def real(folder: Path, picture: Path) -> None:
+    """A ball pressed into a real sensor, calibrated by its background and the prior of its type."""
+    background, presses = vts.read_presses(folder)
+    sensor, press = vts.Sensor.load("gelsight_mini"), presses[len(presses) // 2]
+    pipe = vts.DepthPipeline.from_calibration(vts.calibrate(background, sensor)).freeze()
+    out = pipe(press.image[None])
+    title = f"a ball of {press.ball_diameter_mm:g} mm on a GelSight Mini, by its background alone"
+    viz.save_figure(viz.depth_figure(out.depth_mm, sensor.mm_per_pixel, press.image, out.contact, title), picture)
+    print(f"{picture}: {press.name} of {folder.name}, {float(out.depth_mm.max()):.2f} mm deep")
 
 
 def rolled(share: float, seed: int) -> DrawnPress:

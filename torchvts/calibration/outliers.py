@@ -117,7 +117,8 @@ def _reject_slopes(left: list[Contact], errors_deg: list[float], by_prior: bool)
     far = FAR_DEG if by_prior or len(left) < 3 else max(FAR_DEG, 2.0 * usual)
     if not (error > max(3.0 * usual, APART_DEG) or error > far):
         return False
-    left[worst].reason = f"its slopes are {error:.1f} degrees from a ball's, others' {usual:.1f}: not a clean press"
+    off = f"its slopes are {error:.1f} degrees from a ball's, others' {usual:.1f}"
+    left[worst].reason = f"{off}: not a clean press, or a wrong diameter"
     return True
 
 

@@ -71,7 +71,7 @@ def find_background(images: Tensor, sensor: Sensor | None = None, codec: str = "
     if images.shape[0] < 3:
         raise ValueError(
             f"images: expected at least 3 frames without contact, got {images.shape[0]}: the source is too short, or fewer were "
-            "asked for (background_frames, --background-frames)"
+            "asked for (background_frames, --background-frames; 0 keeps a calibration's)"
         )
     _check_steady(images, codec)
     rank = images.sort(0).values

@@ -138,7 +138,8 @@ class SourceFrames:
             self.first.append(pixels)
         if len(self.readable) < least:
             raise ValueError(
-                f"background_frames: expected at least {least} frames from {reader.name}, got {len(self.readable)}: ask for fewer"
+                f"background_frames: expected at least {least} frames from {reader.name}, got {len(self.readable)}: ask for fewer, "
+                "or for 0, which keeps a calibration's background (--background-frames)"
             )
 
     @property

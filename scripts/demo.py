@@ -1,7 +1,7 @@
 """The first minute: a drawn sensor is calibrated by presses of a ball, and a key that rolls and shears over it becomes depth.
 
 Writes film.webp (the camera's frames beside their depth) and press.png (its deepest frame), and prints how far depth is off. Where
-the folder of real images is there (TORCHVTS_DATA, else ../shared/data), real.png is a ball on a GelSight Mini, by the shipped prior.
+the folder of real images is there (TORCHVTS_DATA, else ../shared/data), real.png is a ball on a GelSight Mini, by its prior.
 
 python scripts/demo.py [--out out/demo]
 """
@@ -71,7 +71,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def real(folder: Path, picture: Path) -> None:
     """A ball pressed into a real sensor, calibrated by its background and the prior of its type."""
     background, presses = vts.read_presses(folder)
-    sensor, press = vts.Sensor.load("gelsight_mini"), presses[len(presses) // 2]
+    sensor, press = vts.Sensor.load("gelsight_mini"), presses[0]
     pipe = vts.DepthPipeline.from_calibration(vts.calibrate(background, sensor)).freeze()
     out = pipe(press.image[None])
     title = f"a ball of {press.ball_diameter_mm:g} mm on a GelSight Mini, by its background alone"

@@ -90,7 +90,7 @@ def answer(unit: str, mistake: str, given: Given) -> Answer:
             made = calibrate(given.background, given.sensor, presses=given.presses)
         except ValueError as error:
             return Answer(unit, prior, mistake, names, str(error), (), (), False)
-    out = tuple(row["name"] for row in made.report.get("presses", []) if not row["used"] or row.get("weight", 1.0) < LEFT_OUT)
+    out = tuple(row["name"] for row in made.report.get("presses", []) if row["weight"] < LEFT_OUT)
     return Answer(unit, prior, mistake, names, "", out, tuple(made.report["doubts"]), made.metric)
 
 

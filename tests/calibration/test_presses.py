@@ -633,3 +633,12 @@ def test_few_presses_move_what_a_prior_says_of_depth_by_little(known):
     start = torch.nn.functional.pad(prior.tensor(), (0, 5))
     moved = (fit_depth_brightness(known, field, PITCH, prior).tensor() - start).norm()
     assert moved > 0 and moved < 0.5 * (free - start).norm()
+
+
+def test_a_press_whose_only_witness_is_no_ball_counts_wholly(good, rest):
+    """What was weighed beside a contact that is then left out is weighed again."""
+    flat = vts.Press(seen_by_curve(vts.scenes.cylinder_press(3.0, 1.0, 6.0, 25.0, (1.0, -2.0), *SIZE), 40), BALL_MM, "a cylinder")
+    unit, said = calibrate(rest, GIVEN, [good[0], flat])
+    rows = {row["name"]: row for row in unit.report["presses"]}
+    assert not rows["a cylinder"]["used"] and rows["a cylinder"]["weight"] == 0.0
+    assert rows[good[0].name]["weight"] == 1.0 and not any(text.startswith(f"{good[0].name}:") for text in said), said

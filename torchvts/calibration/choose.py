@@ -168,7 +168,7 @@ def _fitted(given: Given) -> tuple[Made, list[Contact]]:
 
 def _better(second: Calibration, first: Calibration) -> bool:
     """Whether the fit without a prior is to be taken."""
-    more, fewer = (sum(row.get("weight", 1.0) for row in unit.report["presses"] if row["used"]) for unit in (second, first))
+    more, fewer = (sum(row["weight"] for row in unit.report["presses"]) for unit in (second, first))
     if fewer < LEAST_USED * more or more < LEAST_USED * fewer:
         return more > fewer
     error, by_prior = second.report["held_out_deg"], first.report["held_out_deg"]

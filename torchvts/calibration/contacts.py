@@ -250,9 +250,9 @@ def first_pass_depths(contacts: Sequence[Contact], response: ResponseField, pitc
 def press_row(contact: Contact, sensor: Sensor) -> PressRow:
     """The row of a press in the report."""
     row: PressRow = {"name": contact.name, "used": not contact.reason, "reason": contact.reason or contact.doubt}
+    row["weight"] = 0.0 if contact.reason else contact.weight
     if "error_deg" in contact.metrics:
         row["error_deg"], row["gain"] = contact.metrics["error_deg"], contact.metrics["gain"]
-        row["weight"] = contact.weight
     if "gain_std" in contact.metrics:
         row["gain_std"] = contact.metrics["gain_std"]
     if contact.contact_radius_mm > 0:

@@ -60,6 +60,8 @@ def _weigh(contacts: list[Contact], prior: SensorPrior | None, half_mm: float) -
     """Weigh each press, and give a reason to those that are no clean balls, one after the other."""
     while True:
         left = used(contacts)
+        for contact in left:  # the others may have been left out
+            contact.weight, contact.doubt = 1.0, ""
         if len(left) < (1 if prior is not None else 2):
             return
         family = Family(2, -1, half_mm) if prior is None else Family.of(prior.response.field)
@@ -77,8 +79,8 @@ def _weigh(contacts: list[Contact], prior: SensorPrior | None, half_mm: float) -
             contact.metrics |= {"error_deg": errors[k], "gain": float(shown[k])}
             if prior is None:
                 contact.metrics["gain_std"] = float(std[k])
-            doubted = abs(float(far[k])) > DOUBTED
-            contact.doubt = _wrong_diameter(contact, float(gains[k]), len(left) - 1, prior is not None) if doubted else ""
+            if abs(float(far[k])) > DOUBTED:
+                contact.doubt = _wrong_diameter(contact, float(gains[k]), len(left) - 1, prior is not None)
         own = evidence.gains([found] * len(left)).clamp_min(1e-3).tolist()
         scaled = evidence.errors_deg([found / gain for gain in own])
         if not _reject_slopes(left, list(map(min, errors, scaled)), prior is not None):

@@ -75,7 +75,7 @@ def calibrate(
         calibration = choose(Given(background, sensor, kept, progress, force))
     report = calibration.report
     for k, reason in left_out:
-        report["presses"].insert(k, {"name": named[k].name, "used": False, "reason": reason})
+        report["presses"].insert(k, {"name": named[k].name, "used": False, "reason": reason, "weight": 0.0})
     report["doubts"] = [f"{named[k].name}: left out: {reason}" for k, reason in left_out] + report["doubts"]
     for doubt in warnings_of(report):
         warnings.warn(doubt, CalibrationWarning, stacklevel=2)

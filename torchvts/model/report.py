@@ -51,7 +51,7 @@ class PressRow(_PressKeys, total=False):
         contact_radius_px: radius of the contact.
         error_deg: mean angle between the ball's normals and those of the prior, or of the other presses, degrees.
         gain: slopes of the prior, or of the other presses, divided by the ball's slopes.
-        weight: how much of a press it counts, by how far the gain is off.
+        weight: how much of a press it counts, by how far the gain is off; 0 where it was left out.
         gain_std: standard deviation of that, as far as the other presses know the place; absent where a prior is compared.
     """
 

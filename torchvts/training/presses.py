@@ -57,7 +57,7 @@ class Training:
             raise ValueError("presses: expected at least one to learn from, got none")
         return [
             dataclasses.replace(press, center_px=tuple(row["center_px"]), contact_radius_px=row["contact_radius_px"])
-            if row["used"] and row.get("weight", 1.0) > 0.5
+            if row["weight"] > 0.5
             else None
             for press, row in zip(self.presses, self.calibration.report["presses"], strict=True)
         ]

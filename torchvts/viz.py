@@ -363,9 +363,10 @@ def calibration_figure(calibration: Calibration, presses: Sequence[Press]) -> Fi
         calibration: of the unit.
         presses: that were given; those of the report are drawn.
     """
-    rows = {row["name"]: row for row in calibration.report.get("presses", []) if "center_px" in row}
-    shown = [press for press in presses if press.name in rows]
-    shown = shown[:: max(1, -(-len(shown) // PRESSES_SHOWN))]
+    rows = {row["name"]: row for row in calibration.report.get("presses", [])}
+    given = [press for press in presses if press.name in rows]
+    even = given[:: max(1, -(-len(given) // PRESSES_SHOWN))]
+    shown = sorted({*even, *given}, key=lambda press: (rows[press.name]["weight"] > 0.5, press not in even))[:PRESSES_SHOWN]
     doubts = calibration.report.get("doubts") or ["no doubts"]
     text = "\n".join("\n".join(textwrap.wrap(doubt, 150, subsequent_indent="    ")) for doubt in doubts)
     height, width = calibration.background.shape[1:]
@@ -383,25 +384,31 @@ def calibration_figure(calibration: Calibration, presses: Sequence[Press]) -> Fi
     for row in rows.values():
         _circle(axes[0, 0], row)
     if (error := error_over_skin(calibration)) is not None:
-        drawn = axes[0, 1].imshow(error.numpy(), cmap="cividis", vmin=0.0, extent=(-0.5, width - 0.5, height - 0.5, -0.5))
-        axes[0, 1].set_title("normals: error expected, degrees", fontsize=9)
-        figure.colorbar(drawn, ax=axes[0, 1], shrink=0.8)
+        most = float(error.flatten().quantile(0.9))  # corners, where no ball fits, would take all colours
+        extent = (-0.5, width - 0.5, height - 0.5, -0.5)
+        drawn = axes[0, 1].imshow(error.numpy(), cmap="cividis", vmin=float(error.min()), vmax=most, extent=extent)
+        axes[0, 1].set_title("error expected, degrees", fontsize=9)
+        figure.colorbar(drawn, ax=axes[0, 1], shrink=0.7, extend="max")
         for row in rows.values():
             _circle(axes[0, 1], row)
     axes[0, 2].text(0.0, 1.0, _facts(calibration), fontsize=9, va="top", transform=axes[0, 2].transAxes)
     for k, press in enumerate(shown):
         image, left = axes[1 + k // 2, 2 * (k % 2)], axes[1 + k // 2, 2 * (k % 2) + 1]
         row = rows[press.name]
-        off, inner = _left_deg(calibration, press, row), _left_deg(calibration, press, row, INSIDE)
         image.imshow(_picture(press.image))
         _circle(image, row)
         name = press.name if len(press.name) <= NAME_SHOWN else f"...{press.name[-NAME_SHOWN:]}"
-        counts = "" if row.get("weight", 1.0) > 0.5 else f", counts {row['weight']:.2f}"
+        counts = "" if row["weight"] > 0.5 else f", counts {row['weight']:.2f}"
         image.set_title(name + (counts if row["used"] else ", left out"), fontsize=9)
+        if "center_px" not in row:
+            continue
+        off, inner = _left_deg(calibration, press, row), _left_deg(calibration, press, row, INSIDE)
         drawn = left.imshow(off, cmap="cividis", vmin=0.0, vmax=10.0)
-        left.set_title(f"normals off the ball's: {np.nanmean(inner):.1f} degrees", fontsize=9)
+        left.set_title(f"off the ball by {np.nanmean(inner):.1f} degrees", fontsize=9)
+        (x, y), reach = row["center_px"], 1.2 * row["contact_radius_px"]
+        left.set(xlim=(x - reach, x + reach), ylim=(y + reach, y - reach))
         _circle(left, row)
-        figure.colorbar(drawn, ax=left, shrink=0.8)
+        figure.colorbar(drawn, ax=left, shrink=0.7, ticks=[0, 5, 10], extend="max")
     return figure
 
 
@@ -421,6 +428,8 @@ def _picture(image: Tensor) -> Array:
 
 
 def _circle(axes: Any, row: PressRow) -> None:
+    if "center_px" not in row:
+        return
     color, style = ("white", "-") if row["used"] else ("#f1a340", "--")
     drawn = axes.add_patch(Circle(row["center_px"], row["contact_radius_px"], fill=False, color=color, linestyle=style))
     drawn.set_path_effects(_HALO)

@@ -87,6 +87,13 @@ def test_presses_of_the_unit_are_kept(given, count):
     assert again == ([presses[0]], [(k, f"it is {presses[0].name} once more") for k in range(1, count)])
 
 
+def test_one_image_with_two_diameters_is_refused(given):
+    background, presses = given
+    twice = dataclasses.replace(presses[0], ball_diameter_mm=9.0, name="again")
+    with pytest.raises(ValueError, match=r"^presses: expected one diameter for an image, got .* for .* and 9 mm for again, which are"):
+        sort_presses(background, [*presses[:2], twice])
+
+
 def test_presses_of_another_unit_are_refused():
     one, other = drawn_sensor(0), drawn_sensor(5)
     with pytest.raises(
@@ -105,7 +112,7 @@ def test_a_dark_background_is_named(given):
 def test_a_background_with_a_contact_is_doubted(given, count):
     _, presses = given
     assert beside_presses(presses[0].image, presses[-count:]).endswith(
-        "was a press given as the background? take it again without contact"
+        "was a press given as the background? take it again without contact; what is said of presses may come from it"
     )
 
 

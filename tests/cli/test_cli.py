@@ -130,6 +130,8 @@ def test_calibrate_says_in_few_lines_what_to_expect(rig, run_script, tmp_path):
     wrong = run_script("calibrate", *given, "--press", tmp_path / "ball.png", "20", "--press", tmp_path / "background.png", "20")
     left = [line for line in wrong.stdout.splitlines() if line.startswith("left out: press background.png: ")]
     assert wrong.returncode == 0 and len(left) == 1 and "background.png: left out" not in wrong.stderr
+    touched = run_script("calibrate", tmp_path / "ball.png", *given[1:])  # a press as the background
+    assert touched.returncode == 1 and "NOT METRIC" in touched.stdout and "press next" not in touched.stdout
     table = run_script("calibrate", *given, "--candidates")
     assert "| point lights | 0." in table.stdout and "| R | " in table.stdout
 

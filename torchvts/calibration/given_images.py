@@ -136,8 +136,8 @@ def sort_presses(background: Tensor, presses: Sequence[Press]) -> Sorted:
         background: (3, H, W) in [0, 1].
         presses: checked, with names.
     Raises:
-        ValueError: presses with a flaw (:class:`torchvts.model.usable.FrameCheck`), or of another unit; a background much darker
-            than the presses.
+        ValueError: presses with a flaw (:class:`torchvts.model.usable.FrameCheck`), or of another unit; one image with two
+            diameters; a background much darker than the presses.
     """
     if not presses:
         return Sorted([], [])
@@ -158,9 +158,16 @@ def sort_presses(background: Tensor, presses: Sequence[Press]) -> Sorted:
             f"the skin, at most {OTHER_UNIT:.0%} is usual: another unit, another light, or another crop"
         )
     reasons = {k: f"it {flaw.text}" for k, flaw in odd}
-    for k in range(len(presses)):
-        if k not in reasons and (first := _first_like(presses, k)) != k:
-            reasons[k] = f"it is {presses[first].name} once more"
+    for k, press in enumerate(presses):
+        place = next(i for i, one in enumerate(presses) if torch.equal(one.image, press.image))
+        first = presses[place]
+        if first.ball_diameter_mm != press.ball_diameter_mm:
+            raise ValueError(
+                f"presses: expected one diameter for an image, got {first.ball_diameter_mm:g} mm for {first.name} and "
+                f"{press.ball_diameter_mm:g} mm for {press.name}, which are one image: a wrong file, or a wrong diameter"
+            )
+        if k not in reasons and place != k:
+            reasons[k] = f"it is {first.name} once more"
     kept = [press for k, press in enumerate(presses) if k not in reasons]
     return Sorted(kept, sorted(reasons.items()))
 
@@ -172,13 +179,6 @@ def _check_darkness(background: Tensor, presses: Sequence[Tensor]) -> None:
     if share < DARK:
         cause = bits_of(float(background.max())) or "black, or the LEDs were off"
         raise ValueError(f"background: expected a brightness like that of the presses, got {share:.0%} of it: {cause}")
-
-
-def _first_like(presses: Sequence[Press], k: int) -> int:
-    """Index of the first press with the image and the diameter of the k-th."""
-    wanted = presses[k]
-    alike = (i for i, press in enumerate(presses) if press.ball_diameter_mm == wanted.ball_diameter_mm)
-    return next(i for i in alike if torch.equal(presses[i].image, wanted.image))
 
 
 def _cells(image: Tensor, rows: int) -> Tensor:

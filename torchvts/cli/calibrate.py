@@ -66,7 +66,7 @@ def run(arguments: argparse.Namespace) -> int:
     save_figure(calibration_figure(calibration, check_presses(presses, sensor)), picture)
     print(summary_of(calibration, arguments.candidates))
     print(f"wrote {arguments.out} ({arguments.out.stat().st_size / 1000:.0f} kB), and {picture}: what it was made of")
-    return 0
+    return 0 if calibration.metric else 1
 
 
 def check_target_of(out: Path) -> None:

@@ -33,7 +33,8 @@ COMMANDS = {
 
 FAILED, USAGE_OR_INPUT, BUG, INTERRUPTED = 1, 2, 70, 130
 """Exit statuses: nobody reads the output; a request or an input that cannot be used; a bug in torchvts; Ctrl-C. A subcommand
-returns 0, or 1 where it did its job and something is wrong with the images: frames left out or in doubt, a fault, no pose."""
+returns 0, or 1 where it did its job and something is wrong with the images: frames left out or in doubt, a fault, no pose,
+depth that is not metric."""
 
 PACKAGE = f"{Path(__file__).parents[1]}{os.sep}"
 

@@ -44,7 +44,7 @@ def summary_of(calibration: Calibration, tried: bool = False) -> str:
         f"chosen: {reason}" if reason.startswith(f"{kind}:") else f"chosen: {kind}: {reason}",
         f"expected: {expected(calibration)}",
     ]
-    if (least_known := press_next(calibration)) is not None:
+    if calibration.metric and (least_known := press_next(calibration)) is not None:
         place, error_deg = least_known
         x, y = ((n - 0.5 * (size - 1)) * sensor.mm_per_pixel for n, size in zip(place, (sensor.width, sensor.height), strict=True))
         where = f"x {place[0]}, y {place[1]} px of rectified images ({x:+.1f}, {y:+.1f} mm from the middle)"

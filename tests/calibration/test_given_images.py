@@ -90,7 +90,9 @@ def test_presses_of_the_unit_are_kept(given, count):
 def test_one_image_with_two_diameters_is_refused(given):
     background, presses = given
     twice = dataclasses.replace(presses[0], ball_diameter_mm=9.0, name="again")
-    with pytest.raises(ValueError, match=r"^presses: expected one diameter for an image, got .* for .* and 9 mm for again, which are"):
+    with pytest.raises(
+        ValueError, match=r"^presses: expected one diameter for an image, got .* for .* and 9 mm for again, which are"
+    ):
         sort_presses(background, [*presses[:2], twice])
 
 

@@ -26,6 +26,7 @@ import torch
 from torch import Tensor
 
 from ..model.response_field import ResponseField, SensorPrior
+from ..model.stated_error import variance_of
 from .contacts import Contact
 from .field import ContactForms, Family, power_of
 
@@ -114,10 +115,15 @@ class Evidence:
         both = 0.5 * (covariance[:half, :half] + covariance[half:, half:]) / weight.sum().clamp_min(1.0).sqrt()
         return Posterior(self.family, mean.reshape(2, half), both)
 
-    def held_out(self, prior: Prior) -> list[Tensor]:
-        """For each press the coefficients (2, K) by all others."""
+    def held_out(self, prior: Prior) -> list[Posterior]:
+        """For each press the posterior by all others."""
         others = self.weights * (1.0 - torch.eye(len(self.forms), dtype=torch.float64))
-        return [self.posterior(prior, weights).mean for weights in others]
+        return [self.posterior(prior, weights) for weights in others]
+
+    def variances(self, covariances: Sequence[Tensor]) -> Tensor:
+        """(N,): for each press the mean variance of its sines, phi' C phi, by its covariance (K, K)."""
+        inside = [item.terms[:, item.contact.inside()] for item in self.forms]
+        return torch.stack([variance_of(*both).mean() for both in zip(inside, covariances, strict=True)])
 
     def errors_deg(self, coefficients: Sequence[Tensor]) -> list[float]:
         """For each press the mean angle under its coefficients (2, K), degrees."""

@@ -22,7 +22,7 @@ from .core.checks import check_same_size
 from .core.files import write_atomically
 from .model import Calibration
 from .model.report import PressRow
-from .model.stated_error import error_over_skin
+from .model.stated_error import error_over_skin, press_next
 from .pipeline import DepthPipeline
 from .skin import DotMotion
 
@@ -357,7 +357,7 @@ def pose_figure(source: Tensor, target: Tensor, T_target_source: Tensor, title: 
 
 def calibration_figure(calibration: Calibration, presses: Sequence[Press]) -> Figure:
     """What a calibration was made of: the background with the balls where they were found, the error of normals that it states over
-    the skin, up to :data:`PRESSES_SHOWN` presses beside what they leave, and all doubts.
+    the skin with a cross where to press next, up to :data:`PRESSES_SHOWN` presses beside what they leave, and all doubts.
 
     Args:
         calibration: of the unit.
@@ -385,6 +385,8 @@ def calibration_figure(calibration: Calibration, presses: Sequence[Press]) -> Fi
     if (error := error_over_skin(calibration)) is not None:
         drawn = axes[0, 1].imshow(error.numpy(), cmap="cividis", vmin=0.0, extent=(-0.5, width - 0.5, height - 0.5, -0.5))
         axes[0, 1].set_title("normals: error expected, degrees", fontsize=9)
+        if (least_known := press_next(calibration)) is not None:
+            axes[0, 1].plot(*least_known[0], "+", color="white", markersize=9, path_effects=_HALO)
         figure.colorbar(drawn, ax=axes[0, 1], shrink=0.8)
         for row in rows.values():
             _circle(axes[0, 1], row)

@@ -63,6 +63,7 @@ def test_the_module_is_the_command_and_loads_no_more_than_it_needs():
         (["calibrate", "a.png"], "expected either --sensor or --mm-per-pixel"),
         (["calibrate", "a.png", "--sensor", "digit", "--gamma", "2.2"], "--gamma: expected it beside --mm-per-pixel"),
         (["calibrate", "a.png", "--sensor", "digit", "--out", "unit.npz"], "expected a name ending in .safetensors"),
+        (["calibrate", "nofolder", "--mm-per-pixel", "0.1"], "nofolder: no such file or folder"),
         (["stream", "0"], "expected a calibration file and an input, got 0: name both, or --sensor to calibrate"),
         (["stream", "0", "1", "--sensor", "digit"], "expected one source, got 0, 1"),
         (["samples", "gelsight_maxi"], "did you mean 'gelsight_mini'?"),

@@ -49,7 +49,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--every", type=int, default=1, metavar="N", help="each N-th frame of a video, each N-th image")
     kinds = "npz (all), video-npz (one a video), png16, npy, none (npz)"
     parser.add_argument("--format", choices=FORMATS, default="npz", metavar="KIND", help=kinds)
-    parser.add_argument("--cloud", choices=CLOUD_FORMATS, default="none", metavar="KIND", help="contact: ply, pcd, obj (surface)")
+    parser.add_argument(
+        "--cloud", choices=CLOUD_FORMATS, default="none", metavar="KIND", help="contact: ply, pcd; surface: obj, x3p (metres)"
+    )
     add_length_unit(parser)
     parser.add_argument("--pictures", action=argparse.BooleanOptionalAction, help=f"of each frame (of {PICTURES_UP_TO} at most)")
     parser.add_argument("--workers", type=int, metavar="N", help="loader processes of each rank (up to 4)")

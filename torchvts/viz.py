@@ -294,11 +294,11 @@ def comparison_figure(
     return figure
 
 
-def sheet_figure(frames: Sequence[tuple[float, Array]], mm_per_pixel: float, metric: bool = True) -> Figure:
-    """Depth of up to six frames of a stream in one range of colours, with contour lines and one colour bar.
+def sheet_figure(frames: Sequence[tuple[float | str, Array]], mm_per_pixel: float, metric: bool = True) -> Figure:
+    """Depth of a few frames in one range of colours, with contour lines and one colour bar.
 
     Args:
-        frames: time, s, and depth (H, W), mm, of each.
+        frames: time, s, or name, and depth (H, W), mm, of each.
         mm_per_pixel: pixel pitch, mm.
         metric: whether depth is in mm; otherwise the bar says that it is not.
     """
@@ -310,10 +310,10 @@ def sheet_figure(frames: Sequence[tuple[float, Array]], mm_per_pixel: float, met
     span = depth_range(*(depth for _, depth in frames))
     colors, norm = depth_colors(*span)
     step = _round_step(span[1] - span[0])
-    for k, ((time_s, depth), panel) in enumerate(zip(frames, axes.flat)):
+    for k, ((title, depth), panel) in enumerate(zip(frames, axes.flat)):
         picture = panel.imshow(depth, cmap=colors, norm=norm, extent=_extent(depth, mm_per_pixel))
         _draw_lines(panel, depth, mm_per_pixel, step, colors, norm)
-        panel.set_title(f"{time_s:.2f} s", fontsize=10)
+        panel.set_title(title if isinstance(title, str) else f"{title:.2f} s", fontsize=10)
         panel.set(xlabel="x, mm" if k >= len(frames) - columns else "", ylabel="" if k % columns else "y, mm (down)")
     for panel in axes.flat[len(frames) :]:
         panel.remove()

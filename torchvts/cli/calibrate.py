@@ -23,7 +23,7 @@ from ..calibration import Press
 from ..calibration.presses import check_presses
 from ..core.checks import check_positive
 from ..core.containers import find_container
-from ..core.files import make_folder
+from ..core.files import check_folder, make_folder
 from ..model import Calibration, Sensor
 from ..model.summary import summary_of
 from ..stream import StageClock, frames, open_source, read_background, read_press_images
@@ -109,17 +109,19 @@ def by_hand(arguments: argparse.Namespace, picture: Path) -> int:
 
 def write(calibration: Calibration, presses: Sequence[Press], arguments: argparse.Namespace, picture: Path) -> None:
     """Write a calibration and its picture, and print what it is."""
+    make_folder(picture.parent)
     calibration.save(arguments.out)
     save_figure(calibration_figure(calibration, check_presses(presses, calibration.sensor)), picture)
     print(summary_of(calibration, arguments.candidates))
     print(f"wrote {arguments.out} ({arguments.out.stat().st_size / 1000:.0f} kB), and {picture}: what it was made of")
+    print(f"next: torchvts reconstruct {arguments.out} IMAGE --out FOLDER, or torchvts view {arguments.out} 0 for a camera, live")
 
 
 def check_target_of(out: Path) -> None:
     """Refuse a name that is no calibration's before the work that leads to it."""
     if out.suffix != ".safetensors":
         raise UsageError(f"--out: expected a name ending in .safetensors, got {out}")
-    make_folder(out.parent)
+    check_folder(out.parent)
 
 
 def read_given(arguments: argparse.Namespace) -> tuple[Tensor, Sensor, list[Press]]:

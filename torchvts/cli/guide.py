@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ..calibration import Press
 from ..core.checks import in_one_line
-from ..core.files import Pixels, image_to_bytes, make_folder, rgb_from_bgr, write_atomically
+from ..core.files import Pixels, check_folder, image_to_bytes, make_folder, rgb_from_bgr, write_atomically
 from ..model import Calibration, Sensor
 from ..model.gs_sdk import CATALOG_COLUMNS
 from ..model.summary import NOT_METRIC, where_next
@@ -31,7 +31,7 @@ class Session:
     A press that was refused stays as an image and leaves the catalog, and so does not count.
 
     Args:
-        folder: made where it is missing.
+        folder: made, where it is missing, with the background.
         sensor: cuts the images of the folder.
     Attributes:
         background: (3, H, W), rectified; None until there is one.
@@ -41,7 +41,7 @@ class Session:
     """
 
     def __init__(self, folder: Path, sensor: Sensor) -> None:
-        self.folder, self.sensor = make_folder(folder), sensor
+        self.folder, self.sensor = check_folder(folder), sensor
         self.background: Tensor | None = None
         self.presses: list[Press] = []
         self.read()
@@ -56,7 +56,7 @@ class Session:
 
     def set_background(self, image: Tensor) -> None:
         """Keep the picture without contact."""
-        _write_png(self.folder / "background.png", image)
+        _write_png(make_folder(self.folder) / "background.png", image)
         self.read()
 
     def add(self, image: Tensor, ball_diameter_mm: float) -> None:
@@ -215,6 +215,7 @@ class Guide:
             session.leave_out_last()
             self._say(f"press {last}: refused: {in_one_line(error)}")
             return
+        make_folder(self.picture.parent)
         save_figure(calibration_figure(unit, session.presses), self.picture)
         row = next(row for row in unit.report["presses"] if row["name"] == last)
         if not row["used"]:

@@ -1,6 +1,7 @@
 """Draw README's picture: a ball on a real GelSight Mini: image, depth, normals, surface, and its profile beside the true ball.
 
-The unit is calibrated by its background and presses of the other ball, so nothing was learned from the ball that is drawn.
+The unit is calibrated by its background and presses of the other ball, so nothing was learned from the ball that is drawn. Of its
+presses the one is drawn whose normals are off as in the middle of all: half of them are better.
 
     python scripts/hero.py [--data FOLDER] [--out docs/hero.png]
 """
@@ -11,23 +12,26 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 from matplotlib.colors import LightSource, LinearSegmentedColormap
 from matplotlib.figure import Figure
 
 import torchvts as vts
 from lab.commands import main_of, parser_of
+from lab.score import score_press
 from lab.sets import data_folder
 from torchvts import viz
 
-SHOWN = "6.310mm/10"
+BALL_MM = 6.31
 HALF_MM = 4.2
 SKIN = LinearSegmentedColormap.from_list("skin", ["#9a8f86", "#d9cfc5"])
 
 
 class Contact(NamedTuple):
-    """What is drawn: image and normals (H, W, 3), depth (H, W) in mm, contact (H, W), center in px and radius in mm of the ball."""
+    """What is drawn: image and normals (H, W, 3), depth (H, W) in mm, contact (H, W), center in px and radius in mm of the ball;
+    its name, and the mean angle of the normals of its depth off the ball's, degrees."""
 
+    name: str
+    error_deg: float
     image: Any
     depth_mm: Any
     normal: Any
@@ -36,22 +40,27 @@ class Contact(NamedTuple):
     radius_mm: float
 
 
-def reconstruct(folder: Path, sensor: vts.Sensor) -> tuple[Contact, int]:
-    """The contact that is drawn, and the number of presses of the other ball that the unit was calibrated by."""
+def reconstruct(folder: Path, sensor: vts.Sensor) -> tuple[Contact, list[float], int]:
+    """The contact that is drawn, the errors of all presses of its ball, rising, degrees, and the number of presses learned from."""
     background, presses = vts.read_presses(folder)
-    shown = next(press for press in presses if press.name == SHOWN)
-    known = [vts.Press(p.image, p.ball_diameter_mm, p.name) for p in presses if p.ball_diameter_mm != shown.ball_diameter_mm]
+    known = [vts.Press(p.image, p.ball_diameter_mm, p.name) for p in presses if p.ball_diameter_mm != BALL_MM]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", vts.CalibrationWarning)
         calibration = vts.calibrate(background, sensor.without_prior(), known)
-    pipe = vts.DepthPipeline.from_calibration(calibration, mode="precise")
-    with torch.inference_mode():
-        out = pipe(shown.image[None])
-    depth, normal, contact = out.depth_mm[0, 0], out.normal[0].permute(1, 2, 0), out.contact[0, 0]
-    assert shown.center_px is not None
-    center = (float(shown.center_px[0]), float(shown.center_px[1]))
-    image = shown.image.permute(1, 2, 0).numpy()
-    return Contact(image, depth.numpy(), normal.numpy(), contact.numpy(), center, 0.5 * shown.ball_diameter_mm), len(known)
+    pipe = vts.DepthPipeline.from_calibration(calibration, mode="precise").freeze()
+    found = []
+    for press in presses:
+        if press.ball_diameter_mm != BALL_MM or press.contact_radius_px is None:  # of a few no radius was labelled
+            continue
+        out = pipe(press.image[None])
+        score = score_press(press, out.depth_mm, out.normal, sensor.mm_per_pixel)
+        assert press.center_px is not None and score.depth_normal_deg is not None
+        center = (float(press.center_px[0]), float(press.center_px[1]))
+        image, normal = press.image.permute(1, 2, 0).numpy(), out.normal[0].permute(1, 2, 0).numpy()
+        depth, contact = out.depth_mm[0, 0].numpy(), out.contact[0, 0].numpy()
+        found.append(Contact(press.name, score.depth_normal_deg, image, depth, normal, contact, center, 0.5 * BALL_MM))
+    found.sort(key=lambda contact: contact.error_deg)
+    return found[(len(found) - 1) // 2], [contact.error_deg for contact in found], len(known)
 
 
 def draw(contact: Contact, pitch: float) -> Figure:
@@ -110,9 +119,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     if not folder.is_dir():
         parser.error(f"expected presses in {folder}, got no such folder: set TORCHVTS_DATA, or give --data")
     sensor = vts.Sensor.load("gelsight_mini")
-    contact, presses = reconstruct(folder, sensor)
+    contact, errors, presses = reconstruct(folder, sensor)
     viz.save_figure(draw(contact, sensor.mm_per_pixel), arguments.out)
-    print(f"{arguments.out}: press {SHOWN}, calibrated by {presses} presses of the other ball")
+    print(f"{arguments.out}: press {contact.name}, calibrated by {presses} presses of the other ball")
+    number = f"number {errors.index(contact.error_deg) + 1} of {len(errors)}"
+    print(f"normals {contact.error_deg:.1f} degrees off, {number} from the best, {errors[0]:.1f}, to the worst, {errors[-1]:.1f}")
     return 0
 
 

@@ -22,7 +22,7 @@ from .core.checks import check_same_size
 from .core.files import write_atomically
 from .model import Calibration
 from .model.report import PressRow
-from .model.stated_error import error_over_skin
+from .model.stated_error import error_over_skin, press_next
 from .pipeline import DepthPipeline
 from .skin import DotMotion
 
@@ -294,11 +294,11 @@ def comparison_figure(
     return figure
 
 
-def sheet_figure(frames: Sequence[tuple[float, Array]], mm_per_pixel: float, metric: bool = True) -> Figure:
-    """Depth of up to six frames of a stream in one range of colours, with contour lines and one colour bar.
+def sheet_figure(frames: Sequence[tuple[float | str, Array]], mm_per_pixel: float, metric: bool = True) -> Figure:
+    """Depth of a few frames in one range of colours, with contour lines and one colour bar.
 
     Args:
-        frames: time, s, and depth (H, W), mm, of each.
+        frames: time, s, or name, and depth (H, W), mm, of each.
         mm_per_pixel: pixel pitch, mm.
         metric: whether depth is in mm; otherwise the bar says that it is not.
     """
@@ -310,10 +310,10 @@ def sheet_figure(frames: Sequence[tuple[float, Array]], mm_per_pixel: float, met
     span = depth_range(*(depth for _, depth in frames))
     colors, norm = depth_colors(*span)
     step = _round_step(span[1] - span[0])
-    for k, ((time_s, depth), panel) in enumerate(zip(frames, axes.flat)):
+    for k, ((title, depth), panel) in enumerate(zip(frames, axes.flat)):
         picture = panel.imshow(depth, cmap=colors, norm=norm, extent=_extent(depth, mm_per_pixel))
         _draw_lines(panel, depth, mm_per_pixel, step, colors, norm)
-        panel.set_title(f"{time_s:.2f} s", fontsize=10)
+        panel.set_title(title if isinstance(title, str) else f"{title:.2f} s", fontsize=10)
         panel.set(xlabel="x, mm" if k >= len(frames) - columns else "", ylabel="" if k % columns else "y, mm (down)")
     for panel in axes.flat[len(frames) :]:
         panel.remove()
@@ -357,7 +357,7 @@ def pose_figure(source: Tensor, target: Tensor, T_target_source: Tensor, title: 
 
 def calibration_figure(calibration: Calibration, presses: Sequence[Press]) -> Figure:
     """What a calibration was made of: the background with the balls where they were found, the error of normals that it states over
-    the skin, up to :data:`PRESSES_SHOWN` presses beside what they leave, and all doubts.
+    the skin with a cross where to press next, up to :data:`PRESSES_SHOWN` presses beside what they leave, and all doubts.
 
     Args:
         calibration: of the unit.
@@ -388,6 +388,8 @@ def calibration_figure(calibration: Calibration, presses: Sequence[Press]) -> Fi
         extent = (-0.5, width - 0.5, height - 0.5, -0.5)
         drawn = axes[0, 1].imshow(error.numpy(), cmap="cividis", vmin=float(error.min()), vmax=most, extent=extent)
         axes[0, 1].set_title("error expected, degrees", fontsize=9)
+        if calibration.metric and (least_known := press_next(calibration)) is not None:
+            axes[0, 1].plot(*least_known[0], "+", color="white", markersize=9, path_effects=_HALO)
         figure.colorbar(drawn, ax=axes[0, 1], shrink=0.7, extend="max")
         for row in rows.values():
             _circle(axes[0, 1], row)

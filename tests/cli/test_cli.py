@@ -8,6 +8,7 @@ import warnings
 
 import pytest
 import torch
+from conftest import tiny_image
 
 import torchvts as vts
 from torchvts.cli import COMMANDS, main
@@ -63,6 +64,7 @@ def test_the_module_is_the_command_and_loads_no_more_than_it_needs():
         (["calibrate", "a.png"], "expected either --sensor or --mm-per-pixel"),
         (["calibrate", "a.png", "--sensor", "digit", "--gamma", "2.2"], "--gamma: expected it beside --mm-per-pixel"),
         (["calibrate", "a.png", "--sensor", "digit", "--out", "unit.npz"], "expected a name ending in .safetensors"),
+        (["calibrate", "nofolder", "--mm-per-pixel", "0.1"], "nofolder: no such file or folder"),
         (["stream", "0"], "expected a calibration file and an input, got 0: name both, or --sensor to calibrate"),
         (["stream", "0", "1", "--sensor", "digit"], "expected one source, got 0, 1"),
         (["samples", "gelsight_maxi"], "did you mean 'gelsight_mini'?"),
@@ -149,6 +151,30 @@ def test_a_calibrated_place_refuses_frames_of_another_mode_of_the_camera(rig, ru
     assert written.returncode == 0, written.stderr
     other = run_script("reconstruct", tmp_path / "unit.safetensors", tmp_path / "other_mode.png", "--out", tmp_path / "other")
     assert other.returncode == 1 and "raw frames of 60 x 80" in other.stderr and "another mode of the camera" in other.stderr
+
+
+def test_reconstruct_begins_with_a_sheet_keeps_the_order_and_says_what_to_do_next(unit, run_script, tmp_path):
+    for k in (1, 2, 3):
+        vts.write_image(tmp_path / f"{k}.png", tiny_image(k))
+    given = [tmp_path / f"{k}.png" for k in (2, 3, 1)]
+    done = run_script("reconstruct", unit, *given, "--out", tmp_path / "out")
+    said = done.stdout.splitlines()
+    assert (
+        said[0] == f"wrote {tmp_path / 'out' / 'sheet.png'}: the first 3 images in one scale"
+        and (tmp_path / "out/sheet.png").is_file()
+    )
+    assert [line.partition(":")[0] for line in said[1:4]] == ["2.png", "3.png", "1.png"]
+    assert said[-1].startswith("next: ")
+    again = run_script("reconstruct", unit, *given, "--out", tmp_path / "out")
+    assert "in one scale" not in again.stdout and again.returncode == done.returncode
+
+
+@pytest.mark.parametrize("command", ["stream", "reconstruct", "pose", "track"])
+def test_what_is_refused_leaves_no_folder(command, unit, run_script, tmp_path):
+    vts.write_image(tmp_path / "odd.png", torch.zeros(3, 20, 30))
+    given = (tmp_path / "odd.png", tmp_path / "odd.png") if command == "pose" else (tmp_path / "none.avi",)
+    done = run_script(command, unit, *given, "--out", tmp_path / "out")
+    assert done.returncode == 2 and not (tmp_path / "out").exists(), done.stderr
 
 
 def test_what_to_expect_follows_the_source(rig, mini_by_prior):

@@ -1,7 +1,9 @@
 """Result files hold what the pipeline gave, are read without this package or by read_result, and damage is refused."""
 
+import hashlib
 import json
 import zipfile
+from xml.etree import ElementTree
 
 import cv2
 import numpy as np
@@ -118,6 +120,32 @@ def test_a_slanted_plane_is_written_with_its_own_normals(tmp_path):
     cross = np.cross(points[faces[:, 1]] - points[faces[:, 0]], points[faces[:, 2]] - points[faces[:, 0]])
     assert np.allclose(cross / np.linalg.norm(cross, axis=1, keepdims=True), [-0.6, 0.0, 0.8], atol=1e-5)
     assert {tuple(line[1:]) for line in lines if line[0] == "vn"} == {("-0.600000", "0.000000", "0.800000")}
+
+
+def test_x3p_holds_the_contact_in_metres(unit, source, tmp_path):
+    """As any zip and XML: sizes, units, checksums, rows from the bottom, NaN where the object does not touch."""
+    reconstruct_dataset(unit, source / "4.png", tmp_path, cloud="x3p", pictures=False)
+    result = vts.read_result(tmp_path / "4.npz")
+    with zipfile.ZipFile(tmp_path / "4.x3p") as archive:
+        xml, data, sums = (archive.read(name) for name in ("main.xml", "bindata/data.bin", "md5checksum.hex"))
+    root = ElementTree.fromstring(xml)
+
+    def text(path):
+        return root.findtext(path)
+
+    assert root.tag == "{http://www.opengps.eu/2008/ISO5436_2}ISO5436_2"
+    assert (text("Record3/MatrixDimension/SizeX"), text("Record3/MatrixDimension/SizeY")) == (str(WIDTH), str(HEIGHT))
+    for axis, size in (("CX", WIDTH), ("CY", HEIGHT)):
+        assert float(text(f"Record1/Axes/{axis}/Increment")) == pytest.approx(1e-3 * PITCH)
+        assert float(text(f"Record1/Axes/{axis}/Offset")) == pytest.approx(-0.5e-3 * (size - 1) * PITCH)
+    assert text("Record1/Axes/CZ/DataType") == "D" and text("Record3/DataLink/PointDataLink") == "bindata/data.bin"
+    assert text("Record2/Comment").startswith("m, x right, y up, z to the camera") and text("Record2/Instrument/Model") == "rig"
+    assert text("Record3/DataLink/MD5ChecksumPointData") == hashlib.md5(data).hexdigest()
+    assert sums.decode() == f"{hashlib.md5(xml).hexdigest()} *main.xml\n"
+    heights_m = torch.from_numpy(np.frombuffer(data, "<f8").reshape(HEIGHT, WIDTH).copy()).flip(0)
+    contact = result.contact[0, 0]
+    assert torch.equal(heights_m.isnan(), ~contact) and bool(contact.any())
+    assert torch.allclose(heights_m[contact], 1e-3 * result.depth_mm[0, 0][contact].double(), atol=1e-15)
 
 
 def damaged(path, tmp_path, how):

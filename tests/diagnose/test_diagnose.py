@@ -334,6 +334,27 @@ def test_the_command_prints_words_and_json(tmp_path, run_script):
     assert done.returncode == 2 and done.stderr.startswith("torchvts: error: ")
 
 
+def test_the_command_sums_up_a_folder(tmp_path, run_script):
+    case = undisturbed(2)
+    unit, folder = tmp_path / "unit.safetensors", tmp_path / "frames"
+    case.calibration.save(unit)
+    (folder / "day").mkdir(parents=True)
+    (folder / "damaged.png").write_bytes(b"no image")
+    for name in ("day/1.png", "day/2.png"):
+        vts.write_image(folder / name, case.image[0, [2, 1, 0]])
+    vts.write_image(folder / "good.png", case.image[0])
+    done = run_script("diagnose", unit, folder)
+    first, *rows, last = done.stdout.splitlines()
+    assert done.returncode == 1 and first == "4 frames: 1 without a warning or a fault", done.stderr
+    assert rows[0].startswith("fault: in 2 of 4, such as day/1.png: ") and rows[0].endswith("[channels_swapped]")
+    assert any(row.startswith("fault: in 1 of 4, such as damaged.png: ") and row.endswith("[unreadable]") for row in rows)
+    assert last.startswith("next: ")
+    found = json.loads(run_script("diagnose", unit, folder, "--json").stdout)
+    assert (found["ok"], found["frames"]) == (False, 4) and found["findings"][0]["frames"] == ["day/1.png", "day/2.png"]
+    (tmp_path / "empty").mkdir()
+    assert "expected images or videos, got none" in run_script("diagnose", unit, tmp_path / "empty").stderr
+
+
 def test_the_command_cuts_raw_frames_as_reconstruct_does(tmp_path, run_script):
     sensor = dataclasses.replace(vts.Sensor.load("gelsight_mini"), prior=None)
     height, width = sensor.raw_size_px[0]

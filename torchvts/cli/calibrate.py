@@ -2,53 +2,64 @@
 
 SOURCE is an image without contact, several (their median), a video whose first frames are without contact, or a
 calibration folder of gs_sdk (catalog.csv, background.png, N/gelsight.png). Centers of the balls are found.
+With --camera it guides: untouched skin first, then press where it says; each press is kept in a folder.
 
 examples:
   torchvts calibrate background.png --sensor gelsight_mini --out unit.safetensors
   torchvts calibrate background.png --press 1.png 6.31 --sensor gelsight_mini
   torchvts calibrate first_frames.mp4 --mm-per-pixel 0.05
+  torchvts calibrate --camera 0 --ball 6.31 --sensor gelsight_mini
 """
 
 import argparse
 import dataclasses
 import warnings
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
-import torch
+from torch import Tensor
 
-from ..calibration import Press, read_presses
+from ..calibration import Press
 from ..calibration.presses import check_presses
-from ..core.files import make_folder
-from ..model import Sensor
+from ..core.checks import check_positive
+from ..core.containers import find_container
+from ..core.files import check_folder, make_folder
+from ..model import Calibration, Sensor
 from ..model.summary import summary_of
-from ..stream import frames, read_background, read_press_images
+from ..stream import StageClock, frames, open_source, read_background, read_press_images
+from ..stream.numbered import SourceFrames
 from ..viz import calibration_figure, save_figure
-from .options import add_background_frames, add_press, add_sensor, calibrated, cut_frames, load_sensor
+from .guide import Guide, Session, Watch
+from .options import add_background_frames, add_press, add_sensor, calibrated, load_sensor, read_folder
 from .parser import UsageError
+from .source import add_camera_settings, play, settings_of
 
 SMALL_PLACE = 0.3
 """Share of the camera's frame: gels take 0.42 and more; places measured in a preview of half the size at most a quarter."""
 
-USAGE = "SOURCE... (--sensor NAME | --mm-per-pixel MM) [--press IMAGE MM]... [--out FILE]"
+USAGE = "(SOURCE... | --camera SOURCE --ball MM) (--sensor NAME | --mm-per-pixel MM) [--press IMAGE MM]... [--out FILE]"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the subcommand."""
-    parser.add_argument("source", type=Path, nargs="+", metavar="SOURCE", help="images without contact, a video, or a folder")
+    parser.add_argument("source", type=Path, nargs="*", metavar="SOURCE", help="images without contact, a video, or a folder")
     add_sensor(parser)
-    parser.add_argument(
-        "--mm-per-pixel", type=float, metavar="MM", help="pixel pitch of a sensor without a file, in place of --sensor"
-    )
-    parser.add_argument("--gamma", type=float, help="with --mm-per-pixel: value = light^(1/gamma); chosen if not given")
+    parser.add_argument("--mm-per-pixel", type=float, metavar="MM", help="pitch of a sensor without a file")
+    parser.add_argument("--gamma", type=float, metavar="G", help="beside it: value = light^(1/gamma)")
     add_press(parser)
-    parser.add_argument("--use-labels", action="store_true", help="take centers from the folder's label.npz or labels.csv")
-    parser.add_argument("--force", action="store_true", help="go on where presses contradict the pitch or all diameters")
+    parser.add_argument("--camera", metavar="SOURCE", help="guide by a camera; a film stands in for one")
+    parser.add_argument("--ball", type=float, metavar="MM", help="with --camera: diameter of the ball that is pressed")
+    parser.add_argument("--until-deg", type=float, default=3.0, metavar="D", help="end where normals are expected to so many (3)")
+    parser.add_argument("--session", type=Path, metavar="FOLDER", help="keeps the presses (UNIT_presses); goes on")
+    add_camera_settings(parser)
+    parser.add_argument("--use-labels", action="store_true", help="centers from label.npz or labels.csv")
+    parser.add_argument("--force", action="store_true", help="go on where presses contradict all sizes")
     parser.add_argument("--no-prior", action="store_true", help="ignore the prior of the sensor file")
     add_background_frames(parser)
     parser.add_argument(
         "--out", type=Path, default=Path("unit.safetensors"), metavar="FILE", help="calibration to write (unit.safetensors)"
     )
-    parser.add_argument("--candidates", action="store_true", help="also print all models that were tried, and all presses")
+    parser.add_argument("--candidates", action="store_true", help="also print all models and presses")
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -58,14 +69,51 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.sensor is not None and arguments.gamma is not None:
         raise UsageError("--gamma: expected it beside --mm-per-pixel, --sensor has the file's: write gamma into the sensor file")
     check_target_of(arguments.out)
+    picture = arguments.out.with_name(f"{arguments.out.stem}_calibration.png")  # not the name of a background
+    if arguments.camera is not None:
+        return by_hand(arguments, picture)
+    if not arguments.source:
+        raise UsageError("expected images without contact, a video or a folder; or --camera, which guides")
     image, sensor, presses = read_given(arguments)
     presses += read_press_images(arguments.press, sensor)
-    calibration = calibrated(image, sensor, presses, arguments.force)
+    return write(calibrated(image, sensor, presses, arguments.force), presses, arguments, picture)
+
+
+def by_hand(arguments: argparse.Namespace, picture: Path) -> int:
+    """Guide a person with a ball, until the error that was asked for is stated, or the camera or the user ends it."""
+    if arguments.source or arguments.press or arguments.use_labels:
+        raise UsageError("--camera: expected no images beside it: they are taken as you press")
+    if arguments.ball is None:
+        raise UsageError("--camera: expected --ball MM beside it, the diameter of the ball that you press")
+    ball_mm, until_deg = check_positive("--ball", arguments.ball, 1000.0), check_positive("--until-deg", arguments.until_deg, 90.0)
+    camera = SourceFrames(open_source(arguments.camera, settings=settings_of(arguments)), 1, False, StageClock())
+    try:
+        sensor = sensor_of(arguments, lambda: camera.readable[0].shape[:2])
+        session = Session(arguments.session or arguments.out.with_name(f"{arguments.out.stem}_presses"), sensor)
+        guide = Guide(session, Watch(sensor, getattr(camera.reader, "codec", "")), ball_mm, until_deg, picture, arguments.force)
+        lost = None if guide.reached else play(camera, guide.add)
+    finally:
+        camera.close()
+    session.read()  # whole, wherever it was interrupted
+    if session.background is None:
+        raise lost or ValueError(f"--camera: expected a still, untouched skin first, got none: {guide.watch.why_not_at_rest()}")
+    unit = guide.unit or calibrated(session.background, sensor, session.presses, arguments.force)
+    if not guide.reached:
+        print(f"ended before {until_deg:g} degrees were stated; the same command goes on")
+    status = write(unit, session.presses, arguments, picture)
+    if lost is not None:
+        raise lost
+    return status
+
+
+def write(calibration: Calibration, presses: Sequence[Press], arguments: argparse.Namespace, picture: Path) -> int:
+    """Write a calibration and its picture, and print what it is; the exit status."""
+    make_folder(picture.parent)
     calibration.save(arguments.out)
-    picture = arguments.out.with_name(f"{arguments.out.stem}_calibration.png")  # not the name of a background
-    save_figure(calibration_figure(calibration, check_presses(presses, sensor)), picture)
+    save_figure(calibration_figure(calibration, check_presses(presses, calibration.sensor)), picture)
     print(summary_of(calibration, arguments.candidates))
     print(f"wrote {arguments.out} ({arguments.out.stat().st_size / 1000:.0f} kB), and {picture}: what it was made of")
+    print(f"next: torchvts reconstruct {arguments.out} IMAGE --out FOLDER, or torchvts view {arguments.out} 0 for a camera, live")
     return 0 if calibration.metric else 1
 
 
@@ -73,31 +121,31 @@ def check_target_of(out: Path) -> None:
     """Refuse a name that is no calibration's before the work that leads to it."""
     if out.suffix != ".safetensors":
         raise UsageError(f"--out: expected a name ending in .safetensors, got {out}")
-    make_folder(out.parent)
+    check_folder(out.parent)
 
 
-def read_given(arguments: argparse.Namespace) -> tuple[torch.Tensor, Sensor, list[Press]]:
-    """Background, sensor and presses that the arguments name; the sensor knows the size of the frames that a place is cut from."""
+def read_given(arguments: argparse.Namespace) -> tuple[Tensor, Sensor, list[Press]]:
+    """Background, sensor and presses that the arguments name."""
     first = arguments.source[0]
+    sensor = sensor_of(arguments, lambda: size_of(first))
+    for path in arguments.source:
+        check_there(path)
+    if len(arguments.source) == 1 and first.is_dir():
+        background, presses = read_folder(first, sensor, arguments.use_labels)
+        return background, sensor, presses
+    return read_background(arguments.source, sensor, arguments.background_frames), sensor, []
+
+
+def sensor_of(arguments: argparse.Namespace, size: Callable[[], tuple[int, int]]) -> Sensor:
+    """The sensor that the arguments name, which knows of what height and width the frames are that a place is cut from."""
     if arguments.sensor is not None:
         sensor = load_sensor(arguments.sensor)
     else:
-        sensor = Sensor("own sensor", *size_of(first), arguments.mm_per_pixel, gamma=arguments.gamma)
+        sensor = Sensor("own sensor", *size(), arguments.mm_per_pixel, gamma=arguments.gamma)
     if sensor.cuts_a_place and not sensor.raw_size_px:
-        sensor = dataclasses.replace(sensor, raw_size_px=(size_of(first),))
+        sensor = dataclasses.replace(sensor, raw_size_px=(size(),))
         warn_of_a_small_place(sensor)
-    sensor = sensor.without_prior() if arguments.no_prior else sensor
-    if not (len(arguments.source) == 1 and first.is_dir()):
-        return read_background(arguments.source, sensor, arguments.background_frames), sensor, []
-    image, presses = read_presses(first)
-    if not arguments.use_labels:
-        presses = [dataclasses.replace(press, center_px=None, contact_radius_px=None) for press in presses]
-    elif all(press.center_px is None for press in presses):
-        raise UsageError(f"--use-labels: {first} has neither label.npz nor labels.csv: leave --use-labels out, centers are found")
-    elif tuple(image.shape[1:]) != (sensor.height, sensor.width):
-        raise UsageError(f"--use-labels: the images of {first} are raw frames, labels are for cropped ones: leave --use-labels out")
-    image, presses = cut_frames(image, presses, sensor)
-    return image, sensor, presses
+    return sensor.without_prior() if arguments.no_prior else sensor
 
 
 def warn_of_a_small_place(sensor: Sensor) -> None:
@@ -110,7 +158,14 @@ def warn_of_a_small_place(sensor: Sensor) -> None:
         warnings.warn(text, UserWarning, stacklevel=1)
 
 
+def check_there(source: Path) -> None:
+    """Raise unless there is such a file, folder or recording of a container."""
+    if not source.exists() and find_container(source) is None:
+        raise FileNotFoundError(f"{source}: no such file or folder")
+
+
 def size_of(source: Path) -> tuple[int, int]:
     """Height and width of the first image of a source; of a calibration folder, of its background."""
+    check_there(source)
     _, image = next(iter(frames(source / "background.png" if source.is_dir() else source)))
     return image.shape[1], image.shape[2]

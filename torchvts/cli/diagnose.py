@@ -1,9 +1,11 @@
-"""Find what is wrong with a frame or with the calibration for it; docs/diagnose.md explains every finding.
+"""Find what is wrong with frames or with the calibration for them; docs/diagnose.md explains every finding.
 
+IMAGE is one frame, or a folder, a video or a container of them: then it is said which finding how many of them have.
 Exit status 1 where there is a warning or a fault, 0 where there is none.
 
 examples:
   torchvts diagnose unit.safetensors image.png
+  torchvts diagnose unit.safetensors folder/
   torchvts diagnose unit.safetensors image.png --background now.png --json
 """
 
@@ -11,45 +13,114 @@ import argparse
 import dataclasses
 import json
 from pathlib import Path
+from typing import Any
 
 from torch import Tensor
+from tqdm import tqdm
 
-from ..core.files import read_image
-from ..core.recordings import is_film
-from ..diagnose import diagnose
+from ..core.checks import in_one_line
+from ..core.files import read_image, rgb_from_bgr
+from ..core.recordings import count_frames, is_film, raw_frames
+from ..dataset import list_items
+from ..diagnose import SEVERITIES, Finding, diagnose
+from ..model import Calibration
 from ..stream import read_background
 from .options import load_calibration
 
 USAGE = "CALIBRATION IMAGE [--background IMAGE] [--json]"
 
+MOST = 100
+"""So many frames of a recording are looked at; of more, each second, third, ..."""
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the subcommand."""
     parser.add_argument("calibration", type=Path, metavar="CALIBRATION", help="what torchvts calibrate wrote, .safetensors")
-    parser.add_argument("image", type=Path, metavar="IMAGE", help="the frame in question, as the camera gives it")
+    parser.add_argument("image", type=Path, metavar="IMAGE", help="frame, folder or video, as the camera gives it")
     parser.add_argument("--background", type=Path, metavar="IMAGE", help="without contact, of now, if there is one; or a video")
     parser.add_argument("--json", action="store_true", help="print JSON")
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Print the findings."""
-    calibration = load_calibration(arguments.calibration)
-
-    def read(path: Path) -> Tensor:
-        if path == arguments.background and is_film(path):
-            return read_background([path], calibration.sensor)
-        image = read_image(path)
-        try:
-            return calibration.sensor.rectify(image[None])[0]  # raw frames are cut, as by torchvts reconstruct
-        except ValueError:
-            if tuple(image.shape[1:]) == (calibration.sensor.height, calibration.sensor.width):
-                raise  # it seems to be cut already, and torchvts reconstruct would leave it out
-            return image  # of another size: that is a finding
-
-    background = None if arguments.background is None else read(arguments.background)
-    diagnosis = diagnose(background, read(arguments.image), calibration)
+    calibration, now = load_calibration(arguments.calibration), arguments.background
+    if now is None:
+        background = None
+    elif is_film(now):
+        background = read_background([now], calibration.sensor)
+    else:
+        background = cut(read_image(now), calibration)
+    if arguments.image.is_dir() or is_film(arguments.image):
+        return of_recording(arguments, background, calibration)
+    diagnosis = diagnose(background, cut(read_image(arguments.image), calibration), calibration)
     if arguments.json:
         print(json.dumps({"ok": diagnosis.ok, "findings": [dataclasses.asdict(finding) for finding in diagnosis]}, indent=1))
     else:
         print(diagnosis)
+        print(next_step(arguments.calibration, arguments.image, diagnosis.ok))
     return 0 if diagnosis.ok else 1
+
+
+def cut(image: Tensor, calibration: Calibration) -> Tensor:
+    """A frame as ``torchvts reconstruct`` cuts it; one of another size stays, and is a finding.
+
+    Raises:
+        ValueError: it seems to be cut already.
+    """
+    try:
+        return calibration.sensor.rectify(image[None])[0]
+    except ValueError:
+        if tuple(image.shape[1:]) == (calibration.sensor.height, calibration.sensor.width):
+            raise  # torchvts reconstruct would leave it out
+        return image
+
+
+def of_recording(arguments: argparse.Namespace, background: Tensor | None, calibration: Calibration) -> int:
+    """Diagnose the frames of a recording, and print which finding how many of them have, the worst first."""
+    items = list(list_items(arguments.image))
+    total = sum(count_frames(item.file) if item.is_film else 1 for item in items)
+    if total == 0:
+        raise ValueError(f"{arguments.image}: expected images or videos, got none in this folder")
+    frames = (
+        (item.frame_name(k if item.is_film else -1), frame) for item in items for k, frame in enumerate(raw_frames(item.file))
+    )
+    every = -(-total // MOST) if total > MOST else 1
+    found: dict[str, list[tuple[str, Finding]]] = {}
+    count = clean = 0
+    for number, (name, frame) in enumerate(tqdm(frames, total=total, desc="diagnosing", leave=False, disable=None)):
+        if number % every:
+            continue
+        count += 1
+        try:
+            findings = list(diagnose(background, cut(rgb_from_bgr(frame.read()), calibration), calibration))
+        except (OSError, ValueError) as error:
+            findings = [Finding("unreadable", in_one_line(error), "fault", 1.0)]
+        clean += all(finding.severity == "note" for finding in findings)
+        for finding in findings:
+            found.setdefault(finding.name, []).append((name, finding))
+    rows = [summed(same) for same in found.values()]
+    rows.sort(key=lambda row: (SEVERITIES.index(row["severity"]), -len(row["frames"])))
+    if arguments.json:
+        print(json.dumps({"ok": clean == count, "frames": count, "of": total, "findings": rows}, indent=1))
+        return 0 if clean == count else 1
+    looked = f"{count} frames" if every == 1 else f"{count} of {total} frames"
+    print(f"{looked}: {clean} without a warning or a fault")
+    for row in rows:
+        print(
+            f"{row['severity']}: in {len(row['frames'])} of {count}, such as {row['frames'][0]}: {row['message']} [{row['name']}]"
+        )
+    print(next_step(arguments.calibration, arguments.image, clean == count))
+    return 0 if clean == count else 1
+
+
+def summed(same: list[tuple[str, Finding]]) -> dict[str, Any]:
+    """One finding of several frames: the first of the worst, and the names of all, the worst first."""
+    ranked = sorted(same, key=lambda pair: SEVERITIES.index(pair[1].severity))
+    return {**dataclasses.asdict(ranked[0][1]), "frames": [name for name, _ in ranked]}
+
+
+def next_step(unit: Path, image: Path, ok: bool) -> str:
+    """What to do after a diagnosis."""
+    if ok:
+        return f"next: torchvts reconstruct {unit} {image} --out FOLDER"
+    return "next: mend the first finding and take the image again; docs/diagnose.md has what to do about each [name]"

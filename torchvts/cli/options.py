@@ -9,7 +9,7 @@ from pathlib import Path
 
 from torch import Tensor
 
-from ..calibration import CalibrationWarning, Press, calibrate
+from ..calibration import CalibrationWarning, Press, calibrate, read_presses
 from ..core.checks import parse_number
 from ..core.spelling import suggest
 from ..model import Calibration, Sensor, shipped_sensors
@@ -135,6 +135,18 @@ def cut_frames(background: Tensor, presses: Sequence[Press], sensor: Sensor) -> 
         return background, list(presses)  # gs_sdk keeps cropped images, also where raw frames have that size
     given = presses if cut_already else [without_labels(press) for press in presses]
     return sensor.rectify(background[None])[0], [replace(press, image=sensor.rectify(press.image[None])[0]) for press in given]
+
+
+def read_folder(folder: Path, sensor: Sensor, use_labels: bool = False) -> tuple[Tensor, list[Press]]:
+    """Background and presses of a folder in gs_sdk's layout, cut as by :func:`cut_frames`; with its labels, or without."""
+    image, presses = read_presses(folder)
+    if not use_labels:
+        presses = [without_labels(press) for press in presses]
+    elif all(press.center_px is None for press in presses):
+        raise UsageError(f"--use-labels: {folder} has neither label.npz nor labels.csv: leave --use-labels out, centers are found")
+    elif tuple(image.shape[1:]) != (sensor.height, sensor.width):
+        raise UsageError(f"--use-labels: the images of {folder} are raw frames, labels are for cut ones: leave --use-labels out")
+    return cut_frames(image, presses, sensor)
 
 
 def load_calibration(path: Path) -> Calibration:

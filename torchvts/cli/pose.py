@@ -19,7 +19,7 @@ import torch
 from tqdm import tqdm
 
 from .. import viz
-from ..core.files import make_folder, read_image, write_atomically
+from ..core.files import check_folder, make_folder, read_image, write_atomically
 from ..core.recordings import count_frames
 from ..pipeline import DepthOutput, unit_pipeline
 from ..pose import OutputFrame, contact_cloud, read_point_cloud, register_depth, register_points, write_point_cloud
@@ -54,14 +54,20 @@ def run(arguments: argparse.Namespace) -> int:
     if not any(clouds) and len(clouds) != 3:
         names = ", ".join(map(str, arguments.files))
         raise UsageError(f"expected a calibration file, an image, folder or video, and an image as reference, got {names}")
-    make_folder(arguments.out)
+    check_folder(arguments.out)
     results = of_clouds(arguments, *arguments.files) if all(clouds) else of_frames(arguments, *arguments.files)
-    with write_atomically(arguments.out / "pose.json") as temporary:
+    with write_atomically(make_folder(arguments.out) / "pose.json") as temporary:
         temporary.write_text(json.dumps(results if len(results) > 1 else results[0], indent=1) + "\n")
     without = [result for result in results if not result["converged"]]
     if len(results) > 1 and without:
         print(f"no pose in {len(without)} of {len(results)} frames, the first {without[0]['frame']}: {without[0]['message']}")
     print(f"wrote {arguments.out / 'pose.json'}")
+    if all(clouds):
+        print("next: T_target_source of pose.json takes points of the source to the target")
+    elif without:
+        print(f"next: torchvts diagnose {arguments.files[0]} {arguments.files[1]} says what is wrong with the frames")
+    else:
+        print(f"next: torchvts track {arguments.files[0]} FILM --out FOLDER follows the object from its first touch")
     return 1 if without else 0
 
 
@@ -161,6 +167,7 @@ def draw(
     written: OutputFrame,
 ) -> None:
     """Draw both contacts, and write their clouds."""
+    make_folder(arguments.out)
     T = found.T_target_source
     if not arguments.no_pictures:
         viz.save_figure(viz.pose_figure(source, target, T, name), arguments.out / f"{name}_pose.png")

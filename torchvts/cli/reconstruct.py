@@ -13,11 +13,13 @@ examples:
 
 import argparse
 import csv
+import itertools
 import os
 from pathlib import Path
 
 from tqdm import tqdm
 
+from ..core.arrays import Array
 from ..core.files import make_folder
 from ..core.recordings import is_film
 from ..dataset import CLOUD_FORMATS, FORMATS, PICTURES_UP_TO, RunReport, list_items, reconstruct_dataset
@@ -25,7 +27,8 @@ from ..diagnose import Finding, diagnose
 from ..model import Calibration, Sensor
 from ..model.report import warnings_of
 from ..model.summary import NOT_METRIC, SHOWN, doubts_of
-from ..stream import frames, read_background, read_press_images
+from ..stream import Recording, frames, read_background, read_press_images
+from ..viz import save_figure, sheet_figure
 from .options import add_length_unit, add_out, add_pipeline, add_unit, calibrated, contact_of, split_files
 from .parser import UsageError
 
@@ -38,6 +41,9 @@ PASSED = (
 DIAGNOSED = 20
 """So many images are diagnosed; of more, the first of each of so many folders, since each may be of another camera."""
 
+SHEET, NAME_SHOWN = 9, 30
+"""Images on the sheet, and characters of their names."""
+
 USAGE = "CALIBRATION INPUT... --out FOLDER"
 
 
@@ -49,7 +55,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--every", type=int, default=1, metavar="N", help="each N-th frame of a video, each N-th image")
     kinds = "npz (all), video-npz (one a video), png16, npy, none (npz)"
     parser.add_argument("--format", choices=FORMATS, default="npz", metavar="KIND", help=kinds)
-    parser.add_argument("--cloud", choices=CLOUD_FORMATS, default="none", metavar="KIND", help="contact: ply, pcd, obj (surface)")
+    parser.add_argument(
+        "--cloud", choices=CLOUD_FORMATS, default="none", metavar="KIND", help="contact: ply, pcd; surface: obj, x3p (metres)"
+    )
     add_length_unit(parser)
     parser.add_argument("--pictures", action=argparse.BooleanOptionalAction, help=f"of each frame (of {PICTURES_UP_TO} at most)")
     parser.add_argument("--workers", type=int, metavar="N", help="loader processes of each rank (up to 4)")
@@ -66,6 +74,8 @@ def run(arguments: argparse.Namespace) -> int:
     if isinstance(unit, Sensor):
         calibration, unit = calibrate_first(arguments, inputs, unit)
     passed = {name: getattr(arguments, name) for name in PASSED}
+    if arguments.pictures is not False and int(os.environ.get("RANK", "0")) == 0:
+        write_sheet(unit, inputs, arguments)
     report = reconstruct_dataset(calibration, inputs, arguments.out, contact=contact_of(arguments.contact), **passed)
     if report.rank > 0:
         return 0
@@ -77,7 +87,45 @@ def run(arguments: argparse.Namespace) -> int:
     findings = diagnose_some(unit, inputs, report, arguments.every)
     for name, finding in findings:
         print(f"{name}: {finding}")
+    wrong = [name for name, _ in [*findings, *report.failed, *report.doubted]]
+    print(f"next: {next_step(calibration, inputs, arguments, wrong)}")
     return 1 if report.failed or report.doubted or any(finding.severity == "fault" for _, finding in findings) else 0
+
+
+def write_sheet(unit: Calibration, inputs: list[Path], arguments: argparse.Namespace) -> None:
+    """Write sheet.png before all else: depth of the first images in one scale, by which one sees whether all is well.
+
+    It is not written where there are not two images with a contact among them, nor again where a run goes on.
+    """
+    path: Path = arguments.out / "sheet.png"
+    if path.exists() and not arguments.overwrite:
+        return
+    recording = Recording(
+        unit, arguments.mode, network=arguments.network, device=arguments.device, contact=contact_of(arguments.contact)
+    )
+    items = (item for item in list_items(tuple(inputs) if len(inputs) > 1 else inputs[0], arguments.every) if not item.is_film)
+    shown: list[tuple[float | str, Array]] = []
+    for item in itertools.islice(items, SHEET):
+        try:
+            image = unit.sensor.read_image(item.file).clamp(0.0, 1.0)[None]
+        except (OSError, ValueError):  # said where it is to be reconstructed
+            continue
+        if not recording.unusable(image):
+            shown.append((item.path[-NAME_SHOWN:], recording(image).depth_mm[0, 0].double().numpy()))
+    if len(shown) > 1 and max(depth.max() for _, depth in shown) > 0.0:
+        make_folder(path.parent)
+        save_figure(sheet_figure(shown, unit.sensor.mm_per_pixel, unit.metric), path)
+        print(f"wrote {path}: the first {len(shown)} images in one scale", flush=True)
+
+
+def next_step(calibration: Path, inputs: list[Path], arguments: argparse.Namespace, wrong: list[str]) -> str:
+    """What to do after a run in which these frames have findings, were left out, or are in doubt."""
+    if wrong:
+        source = inputs[0] if len(inputs) == 1 else "INPUT"
+        return f"torchvts diagnose {calibration} {source} says what is wrong, the docs/diagnose.md page what to do"
+    if arguments.format in ("npz", "video-npz"):
+        return f"vts.read_result(path) reads a file of {arguments.out} in Python; --cloud ply adds the contact as points"
+    return f"{arguments.out / 'summary.json'} says what the files are"
 
 
 def calibrate_first(arguments: argparse.Namespace, inputs: list[Path], unit: Sensor) -> tuple[Path, Calibration]:
@@ -108,8 +156,9 @@ def print_report(report: RunReport, out: Path, metric: bool) -> None:
     """Print the deepest frames, how many were left out, which are in doubt, and where the results are."""
     with (out / "frames.csv").open(encoding="utf-8", errors="replace", newline="") as stream:
         rows = list(csv.DictReader(stream))
-    rows.sort(key=lambda row: -float(row["deepest_mm"]))
-    shown = rows[:SHOWN]
+    shown = rows  # in the order in which they were given
+    if len(rows) > SHOWN:
+        shown = sorted(rows, key=lambda row: -float(row["deepest_mm"]))[:SHOWN]
     for row in shown:
         depth = f"deepest {float(row['deepest_mm']):.3f} {'mm' if metric else '(not in mm)'}"
         doubt = ", IN DOUBT" if row["doubt"] else ""

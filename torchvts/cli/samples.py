@@ -30,4 +30,5 @@ def run(arguments: argparse.Namespace) -> int:
     folder = fetch_sample(arguments.name, arguments.source, progress=True)
     print(f"{sample.title}\norigin: {sample.origin}\nlicence: {sample.licence}: LICENCE.txt", file=sys.stderr)
     print(folder)
+    print(f"next: torchvts calibrate {folder} --sensor {arguments.name} --out unit.safetensors", file=sys.stderr)
     return 0

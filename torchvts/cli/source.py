@@ -5,6 +5,7 @@ import signal
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import cv2
 import torch
@@ -15,11 +16,11 @@ from ..model import Calibration, Sensor
 from ..stream import (
     CameraSettings,
     Recorder,
-    TactileFrame,
     TactileStream,
     read_background,
     read_press_images,
 )
+from ..stream.numbered import SourceFrames
 from ..stream.sources import FileReader
 from .options import add_pipeline, add_unit, calibrated, contact_of, split_files
 from .parser import UsageError
@@ -28,14 +29,24 @@ from .parser import UsageError
 def add_source(parser: argparse.ArgumentParser, required: bool = True) -> None:
     """Options of the source, the unit, the camera and the pipeline."""
     add_unit(parser, "a camera, video, folder or URL", required)
-    parser.add_argument("--size", nargs=2, type=int, metavar=("W", "H"), help="of a camera's frames, where the driver takes it")
-    parser.add_argument("--fps", type=float, metavar="F", help="of a camera, where the driver takes it")
-    parser.add_argument("--exposure", type=float, metavar="E", help="of a camera, driver's unit; ends automatic exposure")
-    parser.add_argument("--white-balance", type=float, metavar="K", help="of a camera, kelvin; ends automatic white balance")
+    add_camera_settings(parser)
     add_pipeline(parser)
     parser.add_argument("--record", type=Path, metavar="PATH", help="of a camera's raw frames: .mkv, or a folder (PNG)")
     parser.add_argument("--realtime", action="store_true", help="play a recording at its own rate, dropping late frames")
     parser.add_argument("--threads", type=int, default=1, metavar="N", help="of PyTorch and OpenCV (1)")
+
+
+def add_camera_settings(parser: argparse._ActionsContainer) -> None:
+    """``--size``, ``--fps``, ``--exposure`` and ``--white-balance``, for :func:`settings_of`."""
+    parser.add_argument("--size", nargs=2, type=int, metavar=("W", "H"), help="of a camera's frames, where the driver takes it")
+    parser.add_argument("--fps", type=float, metavar="F", help="of a camera, where the driver takes it")
+    parser.add_argument("--exposure", type=float, metavar="E", help="of a camera, driver's unit; ends automatic exposure")
+    parser.add_argument("--white-balance", type=float, metavar="K", help="of a camera, kelvin; ends automatic white balance")
+
+
+def settings_of(arguments: argparse.Namespace) -> CameraSettings:
+    """What is asked of a camera."""
+    return CameraSettings(arguments.size and tuple(arguments.size), arguments.fps, arguments.exposure, arguments.white_balance)
 
 
 def add_video(parser: argparse.ArgumentParser) -> None:
@@ -75,9 +86,7 @@ def open_stream(arguments: argparse.Namespace, unit: Sensor | Calibration, sourc
         device=arguments.device,
         contact=contact_of(arguments.contact),
         record=arguments.record,
-        settings=CameraSettings(
-            arguments.size and tuple(arguments.size), arguments.fps, arguments.exposure, arguments.white_balance
-        ),
+        settings=settings_of(arguments),
     )
     first = arguments.background_frames
     note = f"the first {first} are without contact" if first else "the calibration's background is used as it is"
@@ -87,7 +96,7 @@ def open_stream(arguments: argparse.Namespace, unit: Sensor | Calibration, sourc
     return stream
 
 
-def play(stream: TactileStream, take: Callable[[TactileFrame], bool]) -> OSError | None:
+def play(stream: TactileStream | SourceFrames, take: Callable[[Any], bool]) -> OSError | None:
     """Give every frame to ``take`` until the source ends, it returns False, or Ctrl-C (SIGINT, SIGTERM).
 
     Returns:
@@ -108,7 +117,7 @@ def play(stream: TactileStream, take: Callable[[TactileFrame], bool]) -> OSError
             if not take(frame):
                 break
     except KeyboardInterrupt:
-        print("interrupted: the frames until now are kept")
+        print("interrupted: what came until now is kept")
     except OSError as error:
         lost = error
     finally:

@@ -13,7 +13,7 @@ import argparse
 import contextlib
 from pathlib import Path
 
-from ..core.files import check_target, make_folder
+from ..core.files import check_folder, check_target, make_folder
 from ..stream import Overlay, Sheet, StreamReport, TactileFrame, TactileStream, VideoFile
 from ..viz import save_figure
 from .source import add_source, add_video, load_unit, open_stream, play
@@ -40,13 +40,15 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.out is None:
         print("give --out for an overlay video and files; torchvts view shows the stream live")
     else:
-        make_folder(arguments.out)
+        check_folder(arguments.out)
     with contextlib.ExitStack() as stack:
         stream = stack.enter_context(open_stream(arguments, unit, source))
         if arguments.save_calibration is not None:
             stream.calibration.save(arguments.save_calibration)
             print(f"wrote {arguments.save_calibration}")
         report = StreamReport(stream, arguments.motion)
+        if arguments.out is not None:  # not before: a source that is refused leaves none
+            make_folder(arguments.out)
         sheet = Sheet(stream.calibration.sensor.mm_per_pixel, stream.metric)
         video = None
         if arguments.out is not None and arguments.video != "none":
@@ -59,6 +61,10 @@ def run(arguments: argparse.Namespace) -> int:
                 save_figure(sheet.figure(), arguments.out / "sheet.png")
     if arguments.out is not None:
         print(f"wrote {len(report.rows)} frames to {arguments.out}")
+    if stream.left_out or report.doubted:
+        print("next: torchvts diagnose CALIBRATION RECORDING says what is wrong; --record keeps a camera's frames for it")
+    elif arguments.out is not None and sheet.times:
+        print(f"next: look at {arguments.out / 'sheet.png'}; frames.csv has depth and area of each frame")
     if lost is not None:
         raise lost
     return 1 if stream.left_out or report.doubted else 0

@@ -94,6 +94,10 @@ def run(arguments: argparse.Namespace) -> int:
     print(f"wrote {', '.join(names)} to {arguments.out}")
     if arguments.save is not None:
         print(f"wrote {arguments.save}; rerun {arguments.save} shows it")
+    if found["lost"] or found["left_out"]:
+        print("next: column lost of poses.csv says why; torchvts diagnose CALIBRATION RECORDING looks at the frames")
+    elif arguments.video != "none":
+        print(f"next: look at {arguments.out / f'track.{arguments.video}'}: the axes should stay on the object")
     if lost is not None:
         raise lost
     return 1 if found["lost"] or found["left_out"] else 0

@@ -31,7 +31,7 @@ from .records import Records
 from .settings import Settings, begin, join, locked
 from .worker import RunReport, Worker
 
-CLOUD_FORMATS = ("ply", "obj", "pcd", "none")
+CLOUD_FORMATS = ("ply", "obj", "pcd", "x3p", "none")
 """Kinds of files for the contact of a frame."""
 
 
@@ -70,7 +70,7 @@ def reconstruct_dataset(
         mode: "fast" or "precise".
         format: "npz" (depth, normals, gradient, masks, units; :func:`torchvts.read_result`), "video-npz" (the same, one file a
             video), "png16" (depth in 16 bits), "npy" (depth) or "none".
-        cloud: contact as points, "ply" or "pcd", as a surface, "obj", or "none".
+        cloud: contact as points, "ply" or "pcd", as a surface, "obj" or "x3p" (metres, of the sensor), or "none".
         length_unit: of the clouds, "mm" or "m"; they have the axes of the robot where the sensor has ``sensor_to_robot``.
         pictures: whether to draw each frame; None draws where there are at most ``PICTURES_UP_TO``.
         every: take each N-th frame of a video, each N-th image of a folder.

@@ -15,7 +15,7 @@ from ..model import Calibration
 from ..model.report import warnings_of
 from ..pipeline import DepthOutput
 from ..pose import OutputFrame, write_point_cloud
-from ..pose.surface_files import write_obj
+from ..pose.surface_files import X3P_AXES, write_obj, write_x3p
 from ..skin import SkinMotion
 from .items import VIDEO_FORMAT
 from .loading import Entry
@@ -65,7 +65,11 @@ class Writer:
     def _write_contact(self, path: Path, result: DepthOutput, doubt: str) -> None:
         """The contact as points or as a surface; a comment of the file says what is in doubt."""
         pitch = self.sensor.mm_per_pixel
-        text = self.frame.axes + ("" if self.facts.metric else "; NOT METRIC") + (f"; IN DOUBT: {doubt}" if doubt else "")
+        axes = X3P_AXES if path.suffix == ".x3p" else self.frame.axes
+        text = axes + ("" if self.facts.metric else "; NOT METRIC") + (f"; IN DOUBT: {doubt}" if doubt else "")
+        if path.suffix == ".x3p":  # a grid of the sensor, whatever the frame of clouds
+            write_x3p(path, result.depth_mm, result.contact, pitch, self.sensor.name, text)
+            return
         if path.suffix == ".obj":
             write_obj(path, result.depth_mm, result.normal, result.contact, pitch, self.frame, text)
             return

@@ -44,11 +44,7 @@ def summary_of(calibration: Calibration, tried: bool = False) -> str:
         f"chosen: {reason}" if reason.startswith(f"{kind}:") else f"chosen: {kind}: {reason}",
         f"expected: {expected(calibration)}",
     ]
-    if calibration.metric and (least_known := press_next(calibration)) is not None:
-        place, error_deg = least_known
-        x, y = ((n - 0.5 * (size - 1)) * sensor.mm_per_pixel for n, size in zip(place, (sensor.width, sensor.height), strict=True))
-        where = f"x {place[0]}, y {place[1]} px of rectified images ({x:+.1f}, {y:+.1f} mm from the middle)"
-        lines.append(f"press next: around {where}: there normals are expected to about {error_deg:.1f} degrees")
+    lines += [f"press next: {where}"] if calibration.metric and (where := where_next(calibration)) else []
     saturated = float((calibration.background >= calibration.saturation_light).any(0).double().mean())
     if saturated > SATURATED_SHARE:
         lines.append(f"saturated: {saturated:.0%} of the background: depth is worse there; reduce the exposure and calibrate again")
@@ -61,6 +57,18 @@ def summary_of(calibration: Calibration, tried: bool = False) -> str:
         if "presses" in report:
             lines += ["", *_presses(report["presses"])]
     return "\n".join(lines)
+
+
+def where_next(calibration: Calibration) -> str:
+    """Where a press would say most, and how well normals are known there; "" where :func:`press_next` says nothing."""
+    found = press_next(calibration)
+    if found is None:
+        return ""
+    place, error_deg = found
+    sensor = calibration.sensor
+    x, y = ((n - 0.5 * (size - 1)) * sensor.mm_per_pixel for n, size in zip(place, (sensor.width, sensor.height), strict=True))
+    where = f"x {place[0]}, y {place[1]} px of rectified images ({x:+.1f}, {y:+.1f} mm from the middle)"
+    return f"around {where}: there normals are expected to about {error_deg:.1f} degrees"
 
 
 def doubts_of(report: Report) -> list[str]:

@@ -478,6 +478,7 @@ def test_presses_that_were_not_seen(real, learn):
     assert mean_error_deg(table, unseen) < TABLE_DEG
 
 
+@pytest.mark.parametrize("real", [BLURRED, pytest.param(RAW, marks=pytest.mark.long)], indirect=True)
 def test_the_network_of_gs_sdk_measures_a_ball(data, real):
     flat, presses, most_deg = real
     assert len(presses) == 30

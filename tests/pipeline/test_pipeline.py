@@ -138,7 +138,7 @@ def low_rig(scene, seed=0):
     return pipe, lambda shadows: scenes.render(scene, lights, **camera, seed=2 * seed + 1, shadows=shadows).detach()
 
 
-@pytest.mark.parametrize("shape", ["ball", "cone"])
+@pytest.mark.parametrize("shape", [pytest.param("ball", marks=pytest.mark.long), "cone"])
 def test_a_cast_shadow_is_no_contact_and_no_slope(shape):
     """Of the skin behind, which is undeformed; before, it was called contact, and the depth was 3 to 8 times as wrong."""
     size = (240, 320, 0.0625)
@@ -153,7 +153,7 @@ def test_a_cast_shadow_is_no_contact_and_no_slope(shape):
     assert error < 1.5 * expected + 0.005
 
 
-@pytest.mark.parametrize("place, radius_px", [((130, 190), 25), ((90, 175), 12)])
+@pytest.mark.parametrize("place, radius_px", [((130, 190), 25), pytest.param((90, 175), 12, marks=pytest.mark.long)])
 def test_dirt_that_keeps_a_light_off_leaves_a_fifth_of_the_error_of_the_plain_inverse(place, radius_px):
     scene = scenes.sphere_press(8.0, 1.2, (0.5, -0.4), 240, 320, 0.0625)
     pipe, camera = low_rig(scene)

@@ -184,8 +184,7 @@ def dissimilar() -> Tensor:
     return images.clamp(0.0, 1.0)
 
 
-@pytest.mark.parametrize("kind", ["lights", "response"])
-@pytest.mark.parametrize("mode", ["fast", "precise"])
+@pytest.mark.parametrize("kind, mode", [("lights", "precise"), ("response", "fast")])
 def test_a_frame_of_a_batch_is_that_frame_alone(kind: str, mode: str) -> None:
     """Frozen bit for bit, plain but for rounding."""
     pipe, images = vts.DepthPipeline.from_calibration(unit_of(kind), mode), dissimilar()
@@ -336,8 +335,7 @@ def test_fast_asks_a_device_for_nothing_but_the_parts_of_a_mask(kind: str, monke
     assert len(tensors_beside_buffers(pipe)) > 0  # the tables of the Poisson solver
 
 
-@pytest.mark.parametrize("mode", ["fast", "precise"])
-@pytest.mark.parametrize("kind", ["lights", "response"])
+@pytest.mark.parametrize("kind, mode", [("lights", "precise"), ("response", "fast")])
 def test_the_way_that_asks_for_nothing_gives_the_same_depth(kind: str, mode: str, monkeypatch: pytest.MonkeyPatch) -> None:
     pipe, images = vts.DepthPipeline.from_calibration(unit_of(kind), mode).double(), dissimilar().double()
     images = images if mode == "fast" else images[1:4:2]

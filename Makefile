@@ -36,7 +36,8 @@ test: setup
 test-coverage: setup
 	$(PYTEST) -m "not long" --cov=torchvts --cov-report=term --cov-fail-under=90
 
-# The tests marked long; fuzzed files, drawn scenes and frames by the thousands; the largest graphs. Some twenty minutes on two cores.
+# The tests marked long: the rest of each grid of cases; fuzzed files, drawn scenes and frames by the thousands; the largest graphs. Some twenty
+# minutes on two cores.
 test-long: setup
 	TORCHVTS_TEST_PROFILE=long $(PYTEST) -m long
 

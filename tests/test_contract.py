@@ -196,7 +196,11 @@ def assert_same(one, two, tolerance=0.0):
 QUICKLY_OPTIMISED = [name for name in SCRIPTED if "Pipeline" not in name or name == "DepthPipeline fast"]
 
 
-@pytest.mark.parametrize("dtype, tolerance", [(torch.float64, 1e-11), (torch.float32, 2e-4)])
+@pytest.mark.parametrize(
+    "dtype, tolerance",
+    [(torch.float64, 1e-11), pytest.param(torch.float32, 2e-4, marks=pytest.mark.long)],
+    ids=["double", "single"],
+)
 @pytest.mark.parametrize(
     "name, optimised",
     [(name, name in QUICKLY_OPTIMISED) for name in SCRIPTED]

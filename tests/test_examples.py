@@ -4,6 +4,7 @@ import runpy
 
 import pytest
 from documents import ROOT
+from documents import run as run_document
 
 import torchvts as vts
 
@@ -37,8 +38,10 @@ def test_example_own_sensor(run, tmp_path):
 
 
 def test_example_own_network(run):
-    losses = run("own_network")["losses"]
-    assert losses[-1] < 0.1 * losses[0]
+    """And the page that goes on from it."""
+    names = run("own_network")
+    assert names["losses"][-1] < 0.1 * names["losses"][0]
+    assert run_document(ROOT / "docs" / "training.md", names)["lights"].albedo.grad is not None
 
 
 def test_example_pose(run, tmp_path):

@@ -196,9 +196,13 @@ def test_odd_prime_and_tiny_images_work(height, width, by, mode, kind):
     assert float((out.normal.norm(dim=1) - 1.0).abs().max()) < 1e-5 and bool((out.normal[:, 2] > 0).all())
 
 
+BY_AND_MODE = [pytest.param(by, mode, marks=[] if (by == "lights") == (mode == "precise") else [pytest.mark.long])
+               for by in ("lights", "response") for mode in MODES]  # fmt: skip
+"""Each model and each mode once; make test-long has every pair."""
+
+
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("by", ["lights", "response"])
-@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("by, mode", BY_AND_MODE)
 def test_gradients_by_the_image_are_finite(kind, by, mode):
     calibration = unit(by)
     pipe = vts.DepthPipeline.from_calibration(calibration, mode)
@@ -253,8 +257,7 @@ def in_threads(jobs):
     return results
 
 
-@pytest.mark.parametrize("by", ["lights", "response"])
-@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("by, mode", BY_AND_MODE)
 def test_threads_may_share_a_pipeline(by, mode):
     calibration = unit(by)
     pipe = vts.DepthPipeline.from_calibration(calibration, mode)

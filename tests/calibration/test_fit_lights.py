@@ -102,23 +102,17 @@ def test_too_few_steps_are_reported_with_the_remedy(small_background, small_sens
     assert "stopped at 1 steps" in fit.message and "raise max_steps" in fit.message
 
 
-@pytest.mark.parametrize("gloss", [[0.2, 0.3, 0.25]])
-def test_gloss_is_found_on_a_glossy_skin(ring, small_sensor, gloss):
-    lights = ring(22.0, [15.0, 16.5, 18.0], level=0.2, gloss=gloss)
-    fit = vts.fit_lights(rest(lights, small_sensor, noise_std=0.003, bits=8), small_sensor)
-    assert fit.converged
-    assert fit.lights.gloss.tolist() == pytest.approx(gloss, abs=0.05)
-    assert furthest_mm(fit.lights, lights) < 0.3
-
-
-def test_a_gloss_by_one_image_alone_is_named(ring, small_sensor):
+def test_gloss_is_found_on_a_glossy_skin_and_named(ring, small_sensor):
     """A matt skin under a camera whose black is 0.3 grey levels above 0 looks the same, and depth differs by a tenth."""
-    lights = ring(22.0, [15.0, 16.5, 18.0], level=0.2, gloss=[0.2, 0.3, 0.25])
+    gloss = [0.2, 0.3, 0.25]
+    lights = ring(22.0, [15.0, 16.5, 18.0], level=0.2, gloss=gloss)
     with pytest.warns(vts.CalibrationWarning, match="gloss of 0.3.*one image cannot tell"):
         unit = vts.calibrate(rest(lights, small_sensor, noise_std=0.003, bits=8), small_sensor)
+    assert unit.lights.gloss.tolist() == pytest.approx(gloss, abs=0.05) and furthest_mm(unit.lights, lights) < 0.3
     assert unit.lights.glossy and unit.metric
 
 
+@pytest.mark.long
 def test_a_strong_gloss_takes_more_steps_and_is_found(small_sensor):
     lights = vts.PointLights([[20, 9, 30], [-18, 13, 28], [-2, -22, 33]], [450, 420, 460], [0.3] * 3).requires_grad_(False)
     fit = vts.fit_lights(rest(lights, small_sensor, bits=8), small_sensor)
@@ -142,10 +136,8 @@ def test_vignetting_widens_the_stated_spread(low_rig, small_sensor):
 def test_the_response_of_the_camera_is_part_of_the_model(ring, small_sensor):
     lights = ring()
     image = rest(lights, small_sensor, noise_std=0.003, bits=8, gamma=2.2)
-    sensor = vts.Sensor("rig", 120, 160, 0.25, gamma=2.2)
-    fit = vts.fit_lights(image, sensor)
+    fit = vts.fit_lights(image, vts.Sensor("rig", 120, 160, 0.25, gamma=2.2))
     assert fit.converged and furthest_mm(fit.lights, lights) < 0.3
-    assert furthest_mm(vts.fit_lights(image, small_sensor).lights, lights) > 5.0
 
 
 def seen(scene, lights, vignetting=0.0, ambient=0.0, gamma=1.0, noise_std=0.003, bits=8):
@@ -177,7 +169,7 @@ def test_the_camera_is_found_and_the_depth_does_not_feel_it(low_rig, small_senso
     assert json.loads(json.dumps(report)) == report
 
 
-@pytest.mark.parametrize("camera", [{"vignetting": 0.05}, {"vignetting": 0.2}, {"ambient": 0.1}])
+@pytest.mark.parametrize("camera", [{"vignetting": 0.05}, {"ambient": 0.1}])
 def test_what_lights_do_not_explain_is_said(low_rig, small_sensor, camera):
     """The fit is of lights alone: a lens that darkens the corners, or stray light, leaves a misfit, and depth is not metric."""
     flat = scenes.undeformed(scenes.sphere_press(10, 1, (0, 0), 120, 160, 0.25))
@@ -197,8 +189,6 @@ def test_ambient_light_survives_the_file(tmp_path, low_rig, small_sensor):
     assert torch.equal(loaded.ambient, calibration.ambient) and torch.equal(loaded.offset, calibration.offset)
     rested = vts.Compensate.from_calibration(loaded)(seen(flat, low_rig, ambient=0.1))
     assert float((rested[0] - loaded.flat).abs().max()) < 1e-5
-    with pytest.raises(ValueError, match=r"ambient: expected \(3,\) finite values of at least 0"):
-        vts.Calibration.from_lights(low_rig, small_sensor, ambient=torch.tensor([0.1, -0.1, 0.1]))
 
 
 TACTO_MM = torch.tensor([[-17.3205, -10.0, 17.0], [17.3205, -10.0, 17.0], [0.0, 20.0, 17.0]])  # manifest.json, v up
@@ -287,7 +277,7 @@ def test_levenberg_marquardt_solves_independent_problems():
     def residual(values):
         return torch.stack((10 * (values[:, 1] - values[:, 0] ** 2), 1 - values[:, 0]), dim=1)
 
-    losses = torch.stack([optimiser.step(residual) for _ in range(100)])
+    losses = torch.stack([optimiser.step(residual) for _ in range(40)])
     assert torch.allclose(parameter.detach(), torch.ones(2, 2, dtype=torch.float64), atol=1e-10)
     assert losses[0, 0] == pytest.approx(0.5 * (4.4**2 + 2.2**2))
     assert bool((losses[1:] <= losses[:-1]).all()), "a step that would raise the loss is not taken"

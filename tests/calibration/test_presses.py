@@ -228,38 +228,18 @@ def test_the_true_field_is_found_where_the_balls_were(unit):
     assert float(off.mean()) < 0.03 and float(off.max()) < 0.15, (float(off.mean()), float(off.max()))
 
 
-def test_calibrating_twice_gives_the_same_parameters(by_good, good, rest):
-    one, two = by_good, calibrate(rest, GIVEN, good)[0]
-    # LAPACK's last digit depends on where its arrays lie in memory
-    for first, second in ((one.response.field, two.response.field), (one.response.by_depth, two.response.by_depth)):
-        assert torch.allclose(first.tensor(), second.tensor(), rtol=1e-9, atol=1e-11)
-    assert one.report["reason"] == two.report["reason"]
-
-
-def test_a_mirrored_unit_is_calibrated_alike(by_good, good, rest):
-    """Images flipped left to right give the same depth, flipped."""
-    scene_image = seen_by_curve(ball((1.5, -2)), 77)
-    plain = by_good
-    mirrored, _ = calibrate(rest.flip(2), GIVEN, [dataclasses.replace(p, image=p.image.flip(2)) for p in good])
-    for row, other in zip(plain.report["presses"], mirrored.report["presses"]):
-        assert other["center_px"] == pytest.approx([WIDTH - 1 - row["center_px"][0], row["center_px"][1]], abs=0.1)
-    depth, flipped = (
-        vts.DepthPipeline.from_calibration(c)(image[None]).depth_mm
-        for c, image in ((plain, scene_image), (mirrored, scene_image.flip(2)))
-    )
-    assert float((depth - flipped.flip(3)).abs().max()) < 0.01
-
-
-def test_a_unit_of_length_does_not_matter(by_good, good, rest):
-    """Pitch and balls twice as large: the same slopes."""
+def test_a_mirrored_unit_of_twice_the_size_is_calibrated_alike(by_good, good, rest):
+    """Images flipped left to right, pitch and balls twice as large: the same slopes, flipped, and twice the depth."""
     double = dataclasses.replace(GIVEN, mm_per_pixel=2 * PITCH)
-    one = by_good
-    two, _ = calibrate(rest, double, [dataclasses.replace(p, ball_diameter_mm=2 * BALL_MM) for p in good])
-    for row, other in zip(one.report["presses"], two.report["presses"]):
-        assert other["center_px"] == pytest.approx(row["center_px"], abs=1e-4)
-    left, right = one.response.field, two.response.field
+    flipped = [dataclasses.replace(p, image=p.image.flip(2), ball_diameter_mm=2 * BALL_MM) for p in good]
+    other, _ = calibrate(rest.flip(2), double, flipped)
+    for row, mirrored in zip(by_good.report["presses"], other.report["presses"]):
+        assert mirrored["center_px"] == pytest.approx([WIDTH - 1 - row["center_px"][0], row["center_px"][1]], abs=0.1)
+    left, right = by_good.response.field, other.response.field
     assert (left.degree, left.product_degree, 2 * left.half_mm) == (right.degree, right.product_degree, right.half_mm)
-    assert torch.allclose(left.tensor(), right.tensor(), rtol=0, atol=1e-5)
+    image = seen_by_curve(ball((1.5, -2)), 77)
+    one, two = (vts.DepthPipeline.from_calibration(c)(i[None]).depth_mm for c, i in ((by_good, image), (other, image.flip(2))))
+    assert float((2 * one - two.flip(3)).abs().max()) < 0.02
 
 
 def test_balls_of_several_sizes_go_together(rest):
@@ -320,13 +300,12 @@ def test_a_prior_is_as_good_as_its_file_says(prior, prior_alone):
     assert calibrate(background(seen_by_other_curve), unmeasured)[0].report["prior_deg"] is None
 
 
-def test_the_error_of_too_few_presses_to_hold_out_is_stated_by_what_they_leave_open(prior):
-    one = take_presses()[:1]
-    report = calibrate(background(), GIVEN, one)[0].report
+def test_the_error_of_too_few_presses_to_hold_out_is_stated_by_what_they_leave_open(prior, by_good, good, rest):
+    one = good[:1]
+    report = calibrate(rest, GIVEN, one)[0].report
     assert report["held_out_deg"] is None and 0.0 < report["own_deg"] < 5.0 and "prior_deg" not in report
-    more = calibrate(background(), GIVEN, take_presses()[:6])[0].report
-    assert report["stated_deg"] > 1.2 * more["stated_deg"]
-    assert calibrate(background(), dataclasses.replace(GIVEN, prior=prior), one)[0].report["prior_deg"] == prior.expected_deg
+    assert report["stated_deg"] > 1.2 * by_good.report["stated_deg"]
+    assert calibrate(rest, dataclasses.replace(GIVEN, prior=prior), one)[0].report["prior_deg"] == prior.expected_deg
 
 
 def test_a_sensor_without_a_prior_has_none_to_score():
@@ -334,6 +313,7 @@ def test_a_sensor_without_a_prior_has_none_to_score():
         score_prior(background(), dataclasses.replace(SENSOR, name="presses"), take_presses()[:3])
 
 
+@pytest.mark.long
 def test_a_prior_of_two_units_lies_between_theirs_and_says_how_far_they_are_apart(prior):
     unit = PriorUnit(background(seen_by_other_curve), SENSOR, other_presses(5))
     joint = fit_prior(background(), SENSOR, take_presses(), "both", [unit])
@@ -365,25 +345,19 @@ def test_lights_are_tried_where_the_prior_is_left_out(prior):
     assert "one image constrains the lights to" in calibration.report["reason"]
 
 
-@pytest.mark.parametrize("mode", ["fast", "precise"])
-@pytest.mark.parametrize("count", [1, 3, 5])
-def test_presses_of_another_ball_do_no_harm_to_a_prior(prior, prior_alone, count, mode):
+@pytest.mark.parametrize("count", [1, pytest.param(3, marks=pytest.mark.long), 5])
+def test_presses_of_another_ball_do_no_harm_to_a_prior(prior, prior_alone, count):
     sensor = dataclasses.replace(GIVEN, prior=prior)
     calibration, warned = calibrate(background(seen_by_other_curve), sensor, other_presses(count))
     assert warned == [] and "from the sensor's prior and " in calibration.report["reason"]
-    alone = depth_errors(prior_alone[0], seen_by_other_curve, ball, mode, HELD_OUT)
-    after = depth_errors(calibration, seen_by_other_curve, ball, mode, HELD_OUT)
-    assert all(b < 1.1 * a for a, b in zip(alone, after)), (alone, after)
-    if count == 5:  # enough to be worth something
-        assert after[1] < 0.8 * alone[1]
-
-
-def test_balls_are_found_with_a_prior_from_one_press_on(prior):
-    sensor = dataclasses.replace(GIVEN, prior=prior)
-    calibration, _ = calibrate(background(seen_by_other_curve), sensor, other_presses(1))
     row = calibration.report["presses"][0]
     assert math.dist(row["center_px"], in_px((1, -1))) < 1.0
     assert row["contact_radius_px"] == pytest.approx(math.sqrt(9 * 0.4 - 0.16) / PITCH, abs=2.0)
+    for mode in ("fast", "precise"):
+        alone = depth_errors(prior_alone[0], seen_by_other_curve, ball, mode, HELD_OUT)
+        after = depth_errors(calibration, seen_by_other_curve, ball, mode, HELD_OUT)
+        assert all(b < 1.1 * a for a, b in zip(alone, after)), (alone, after)
+        assert count < 5 or after[1] < 0.8 * alone[1]  # enough to be worth something
 
 
 def test_a_prior_sees_a_wrong_diameter_in_a_single_press(prior):
@@ -405,31 +379,31 @@ def test_a_background_of_another_type_is_warned_of(prior):
 # known centers
 
 
-def test_known_centers_are_kept(good, rest):
+def test_known_centers_are_kept_and_their_radii_found(good, rest):
     known = [dataclasses.replace(p, center_px=in_px(c)) for p, c in zip(good, CENTERS_MM)]
     given = dataclasses.replace(good[0], center_px=[79.0, 60.0], contact_radius_px=12.0)
-    calibration, warned = calibrate(rest, GIVEN, [given, known[1], *good[2:]])
+    calibration, warned = calibrate(rest, GIVEN, [given, *known[1:4], *good[4:]])
     rows = calibration.report["presses"]
-    assert warned == [] and rows[1]["center_px"] == pytest.approx(known[1].center_px, abs=1e-9)
+    assert warned == []
+    for row, press, depth in list(zip(rows, known, DEPTHS_MM))[1:4]:
+        assert row["center_px"] == pytest.approx(press.center_px, abs=1e-9)
+        assert row["contact_radius_px"] == pytest.approx(math.sqrt(BALL_MM * depth - depth**2) / PITCH, abs=1.5)
     assert rows[0]["center_px"] == pytest.approx([79.0, 60.0], abs=1e-9) and rows[0]["contact_radius_px"] == pytest.approx(12.0)
 
 
-def test_the_radius_of_a_press_with_a_known_center_is_found(good, rest):
-    known = [dataclasses.replace(p, center_px=in_px(c)) for p, c in zip(good, CENTERS_MM)]
-    for row, press, depth in zip(calibrate(rest, GIVEN, known)[0].report["presses"], known, DEPTHS_MM):
-        assert row["center_px"] == pytest.approx(press.center_px, abs=1e-9)
-        assert row["contact_radius_px"] == pytest.approx(math.sqrt(BALL_MM * depth - depth**2) / PITCH, abs=1.5)
+ODD = {
+    "outside of the image": {"center_px": (1000.0, 1000.0)},
+    "beside the contact": {"center_px": (5.0, 5.0)},
+    "a radius below a pixel": {"center_px": in_px((0, 0)), "contact_radius_px": 0.1},
+}
 
 
-@pytest.mark.parametrize(
-    "odd",
-    [{"center_px": (1000.0, 1000.0)}, {"center_px": (5.0, 5.0)}, {"center_px": in_px((0, 0)), "contact_radius_px": 0.1}],
-    ids=["outside of the image", "beside the contact", "a radius below a pixel"],
-)
-def test_a_center_that_cannot_be_is_left_out_with_a_reason(good, rest, odd):
-    calibration, warned = calibrate(rest, GIVEN, [*good[1:], dataclasses.replace(good[0], name="odd", **odd)])
-    row = calibration.report["presses"][-1]
-    assert not row["used"] and row["reason"] and any(text.startswith("odd: left out: ") for text in warned)
+def test_a_center_that_cannot_be_is_left_out_with_a_reason(good, rest):
+    calibration, warned = calibrate(
+        rest, GIVEN, [*good[1:4], *(dataclasses.replace(good[0], name=name, **odd) for name, odd in ODD.items())]
+    )
+    for row in calibration.report["presses"][3:]:
+        assert not row["used"] and row["reason"] and any(text.startswith(f"{row['name']}: left out: ") for text in warned)
     json.dumps(calibration.report, allow_nan=False)
 
 
@@ -462,6 +436,7 @@ def mixed(good, rest):
         "twice the diameter": (image, 2 * BALL_MM),
         "half the diameter": (seen_by_curve(ball((1, -2)), 11), 0.5 * BALL_MM),
         "a diameter in metres": (seen_by_curve(ball((1, -2)), 12), 0.001 * BALL_MM),
+        "an absurd diameter": (seen_by_curve(ball((1, -2)), 13), 500.0),
         "saturated": (torch.where(contact, torch.ones_like(image), image), BALL_MM),
         "two balls": (seen_by_curve(two_balls(), 7), BALL_MM),
         "another scene": (torch.rand(image.shape, generator=torch.Generator().manual_seed(10)), BALL_MM),
@@ -482,6 +457,7 @@ REASONS = {
     "twice the diameter": "but 12 mm was given: a wrong diameter, or skin that answers otherwise",
     "half the diameter": "3 mm",
     "a diameter in metres": "is its diameter in mm?",
+    "an absurd diameter": "not a clean press, or a wrong diameter",
     "saturated": r"\d+% of the contact is saturated: lower the exposure",
     "two balls": "2 contacts in one image: press one ball at a time",
     "another scene": "another unit, other exposure, or the light has changed",
@@ -520,13 +496,12 @@ def test_two_wrong_diameters_among_seven_count_little(good, rest):
     assert min(weights[:5]) > 0.5 and max(weights[5:]) < 0.15
 
 
-@pytest.mark.parametrize("sizes, warned", [((6.0, 6.0), 0), ((4.0, 9.0), 1)])
-def test_two_sizes_exchanged_are_warned_of(rest, sizes, warned):
+def test_two_sizes_exchanged_are_warned_of(rest):
     """Then half of the presses contradict the other half, and none of them stands out."""
-    presses = [dataclasses.replace(p, ball_diameter_mm=sizes[k % 2]) for k, p in enumerate(take_presses(count=10))]
+    presses = [dataclasses.replace(p, ball_diameter_mm=(4.0, 9.0)[k % 2]) for k, p in enumerate(take_presses(count=10))]
     unit, said = calibrate(rest, GIVEN, presses)
-    assert sum("by each other the balls seem" in text for text in said) == warned, said
-    assert unit.metric is not bool(warned) and any("by each other" in doubt for doubt in unit.report["not_metric"]) == bool(warned)
+    assert sum("by each other the balls seem" in text for text in said) == 1, said
+    assert not unit.metric and any("by each other" in doubt for doubt in unit.report["not_metric"])
 
 
 def test_lights_on_one_line_show_no_slopes_across_it():
@@ -539,24 +514,15 @@ def test_lights_on_one_line_show_no_slopes_across_it():
     with pytest.warns(
         vts.CalibrationWarning, match=r"slopes along [89]\d degrees from x are found 0\.\d\d times as large .* one line"
     ):
-        unit = vts.calibrate(background(camera), SENSOR, take_presses(camera))
+        unit = vts.calibrate(background(camera), GIVEN, take_presses(camera, count=6))
     assert not unit.metric
-
-
-@pytest.mark.parametrize("ball_mm", [500.0, pytest.param(60.0, marks=pytest.mark.long)])
-def test_an_absurd_diameter_counts_nothing(good, rest, ball_mm):
-    calibration, warned = calibrate(
-        rest, GIVEN, [*good, dataclasses.replace(take_presses(count=8)[7], ball_diameter_mm=ball_mm, name="absurd")]
-    )
-    assert len(warned) == 1 and warned[0].startswith("absurd: ") and calibration.report["presses"][-1].get("weight", 0.0) < 0.01
 
 
 @pytest.mark.parametrize(
     "count, times",
     [
         (3, 1.5),
-        (5, 1 / 1.5),
-        *[pytest.param(n, t, marks=pytest.mark.long) for n, t in ((3, 1 / 1.9), (5, 1.5), (9, 1.5), (9, 1 / 1.5))],
+        *[pytest.param(n, t, marks=pytest.mark.long) for n, t in ((3, 1 / 1.9), (5, 1.5), (5, 1 / 1.5), (9, 1.5), (9, 1 / 1.5))],
     ],
 )
 def test_one_wrong_diameter_costs_no_good_press_and_hardly_moves_a_ball(rest, count, times):
@@ -588,32 +554,18 @@ def test_only_bad_presses_are_an_error_that_names_each(rest):
             call()
 
 
-@pytest.mark.parametrize("times", [0.5, 1.5, 2.0])
+@pytest.mark.parametrize("times", [0.5, 1.5])
 def test_two_presses_that_contradict_each_other_are_not_metric(good, rest, times):
     wrong = dataclasses.replace(good[4], ball_diameter_mm=times * BALL_MM)
     unit, _ = calibrate(rest, GIVEN, [good[0], wrong])
     assert not unit.metric and any("by each other the balls seem" in doubt for doubt in unit.report["not_metric"])
 
 
-BAD_IMAGES = {
-    "another size": (lambda i: i[:, :100], ValueError, r"expected \(3, 120, 160\) .* got \(3, 100, 160\): resize it"),
-    "a batch": (lambda i: i[None], ValueError, r"got \(1, 3, 120, 160\): take one image of the batch with \[0\]"),
-    "channels last": (lambda i: i.permute(1, 2, 0), ValueError, "channels stand last"),
-    "0-255": (lambda i: 255 * i, ValueError, "0-255 given for 0-1: divide by 255"),
-    "bytes": (lambda i: (255 * i).to(torch.uint8), TypeError, "expected a floating-point image, got torch.uint8: divide by 255"),
-    "NaN": (lambda i: torch.full_like(i, float("nan")), ValueError, "expected finite values, got 57600 NaN or infinite"),
-    "a path": (lambda i: "press.png", TypeError, "expected a torch.Tensor, got str: read files with torchvts.read_image"),
-    "none": (lambda i: None, TypeError, "expected a torch.Tensor, got NoneType"),
-}
-
-
-@pytest.mark.parametrize("kind", BAD_IMAGES)
 @pytest.mark.parametrize("call", [vts.calibrate, fit_prior])
-def test_a_bad_image_is_refused_by_its_place(good, rest, call, kind):
-    change, error, message = BAD_IMAGES[kind]
-    unnamed = dataclasses.replace(good[0], name="", image=change(good[0].image))
-    with pytest.raises(error, match=rf"^presses\[2\]: image: .*{message}"):
-        call(rest, GIVEN, [*good[:2], unnamed])
+def test_a_bad_image_is_refused_by_its_place(good, rest, call):
+    small = dataclasses.replace(good[0], name="", image=good[0].image[:, :100])
+    with pytest.raises(ValueError, match=r"^presses\[2\]: image: expected \(3, 120, 160\) .* got \(3, 100, 160\): resize it"):
+        call(rest, GIVEN, [*good[:2], small])
 
 
 @pytest.fixture(scope="module")

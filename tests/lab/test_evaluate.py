@@ -215,7 +215,9 @@ def test_a_method_or_a_set_that_fails_is_a_row_with_its_reason(folder, monkeypat
     )
 
 
-@pytest.mark.parametrize("name", sets.REAL)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[] if name in ("gelsight_mini_a", "digit_b") else [pytest.mark.long]) for name in sets.REAL]
+)
 def test_real_sets_are_read(data, monkeypatch, name):
     monkeypatch.setattr(presses_room, "calibrate", FailingUnit)  # balls without a label are not located here
     monkeypatch.setattr(sets, "fit_prior", lambda *arguments: None)

@@ -1,7 +1,6 @@
 """The bench: rows of small scenes, their table, JSON and chart; no test asserts a time."""
 
 import dataclasses
-from pathlib import Path
 
 import pytest
 
@@ -52,8 +51,5 @@ def test_a_chart_is_drawn_again_from_its_table(run_script, tmp_path):
     (tmp_path / "bench.json").write_text(rows.to_json(ROWS))
     done = run_script("figures", "speed", tmp_path / "bench.json", tmp_path / "chart.png")
     assert done.returncode == 0 and (tmp_path / "chart.png").stat().st_size > 10_000
-    points = Path(__file__).parents[1] / "breaking_points.json"
-    done = run_script("figures", "overview", points, tmp_path / "overview.png")
-    assert done.returncode == 0 and (tmp_path / "overview.png").stat().st_size > 10_000
     done = run_script("figures", "speed", tmp_path / "none.json", tmp_path / "chart.png")
     assert done.returncode == 1 and done.stderr.startswith("error: ") and "none.json" in done.stderr

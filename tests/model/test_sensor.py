@@ -276,6 +276,7 @@ def test_the_wedge_video_is_rectified_to_its_gel(data):
     assert float(gel.amin()) >= 0 and float(gel.mean(dim=1).amin()) > 0.02, "no pixel from beyond the frame"
 
 
+@pytest.mark.long
 def test_shipped_sensors_are_found_from_an_installed_wheel(tmp_path):
     pytest.importorskip("build")
     pytest.importorskip("hatchling")

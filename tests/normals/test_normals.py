@@ -96,8 +96,7 @@ def test_a_blocked_light_does_not_spoil_the_normal(ring, noise_std, bound_deg, s
     assert ours < bound_deg and ours < share * theirs
 
 
-@pytest.mark.parametrize("press_mm, worst_px", [(0.5, 0.08), (1.0, 0.4)])
-@pytest.mark.parametrize("dead", [0, 1, 2])
+@pytest.mark.parametrize("dead, press_mm, worst_px", [(0, 0.5, 0.08), (1, 1.0, 0.4), (2, 1.0, 0.4)])
 def test_two_leds_go_on_when_one_fails(ring, press_mm, worst_px, dead):
     """What is left of the third channel is noise. The plain inverse errs by more than the press is deep."""
     lights, scene = ring(), press(press_mm, torch.float32, 120, 160)

@@ -1,6 +1,5 @@
 """The tutorials run as they stand, and come to what they promise."""
 
-import runpy
 import shutil
 
 import pytest
@@ -41,11 +40,6 @@ def test_own_sensor(empty_folder):
     names = run(ROOT / "docs" / "own_sensor.md")
     assert float(names["out"].depth_mm.max()) == pytest.approx(0.4, abs=0.02)
     assert names["sensor"].field_mm == pytest.approx((12.0, 16.0))
-
-
-def test_training_through_depth(empty_folder):
-    names = run(ROOT / "docs" / "training.md", runpy.run_path(str(ROOT / "examples" / "own_network.py")))
-    assert names["lights"].albedo.grad is not None
 
 
 def test_the_page_on_motion_runs_and_finds_the_drag():

@@ -54,8 +54,10 @@ def test_levels_are_those_of_gaussian_errors(spread, dimensions):
         assert found == pytest.approx(level, abs=0.02)
 
 
-@pytest.mark.parametrize("noise_std", [0.004, 0.016])
-@pytest.mark.parametrize("rise", [40.0, 25.0])
+@pytest.mark.parametrize(
+    "rise, noise_std",
+    [(25.0, 0.016), *(pytest.param(*rig, marks=pytest.mark.long) for rig in ((40.0, 0.004), (40.0, 0.016), (25.0, 0.004)))],
+)
 def test_noise_and_conditioning_against_many_noisy_frames(ring, noise_std, rise):
     calibration, _, camera = lights_unit(ring, noise_std, background=False, height_mm=rise, radius_mm=35.0)
     pipe = vts.ConfidentPipeline.from_calibration(calibration, "fast")
@@ -75,7 +77,9 @@ def test_noise_and_conditioning_against_many_noisy_frames(ring, noise_std, rise)
 SEEDS = {"lights known": 20000, "lights known, background": 21000, "lights fitted": 22000}
 
 
-@pytest.fixture(scope="module", params=[*list(SEEDS)[:2], pytest.param("lights fitted", marks=pytest.mark.long)])
+@pytest.fixture(
+    scope="module", params=[pytest.param(kind, marks=[] if "background" in kind else [pytest.mark.long]) for kind in SEEDS]
+)
 def covered(request):
     first = SEEDS[request.param]
     return coverage.of_scenes(range(first, first + (10 if "fitted" in request.param else 24)), request.param)
@@ -272,7 +276,7 @@ def test_no_contact(ring):
         assert bool(torch.isfinite(out.normal_95_deg).all()) and float(out.depth_95_mm.max()) < PITCH
 
 
-@pytest.fixture(scope="module", params=["lights fast", "lights precise", "response precise", "response precise"])
+@pytest.fixture(scope="module", params=["lights fast", "lights precise", "response precise"])
 def made(request, ring):
     kind, mode = request.param.split()
     if kind == "lights":

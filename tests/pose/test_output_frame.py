@@ -59,7 +59,15 @@ def test_clouds_of_a_data_set(places, run_script):
         for kind in ("ply", "obj"):
             out = places / f"{name}_{kind}"
             done = run_script(
-                "reconstruct", places / f"{name}.safetensors", places / "3.png", "--out", out, "--cloud", kind, *options
+                "reconstruct",
+                places / f"{name}.safetensors",
+                places / "3.png",
+                "--out",
+                out,
+                "--no-pictures",
+                "--cloud",
+                kind,
+                *options,
             )
             assert done.returncode == 0, done.stderr
     (_, points, normals), (says, there, turned) = (read_ply(places / f"{name}_ply" / "3.ply") for name in ("beside", "on"))

@@ -64,7 +64,7 @@ def keyframe():
     return make_keyframe(surface_of(press(objects.key(), swing(0))), PITCH)
 
 
-@pytest.mark.parametrize("name", ["stamp", "key", "gear"])
+@pytest.mark.parametrize("name", ["gear", *(pytest.param(name, marks=pytest.mark.long) for name in ("stamp", "key"))])
 def test_an_exact_object_is_followed(name):
     height = objects.TARGETS[name].height_mm
     tracker = vts.PoseTracker(press(height, swing(0)), PITCH)
@@ -124,7 +124,9 @@ def test_a_cylinder_keeps_its_axis_unknown_and_is_followed_across():
     assert abs(float(off[1, 0])) < math.radians(0.1)  # yaw is known
 
 
-@pytest.mark.parametrize(("radius", "yaw"), [(1.0, 0.0), (1.2, 40.0), (1.5, 110.0)])
+@pytest.mark.parametrize(
+    ("radius", "yaw"), [(1.2, 40.0), *(pytest.param(*rod, marks=pytest.mark.long) for rod in ((1.0, 0.0), (1.5, 110.0)))]
+)
 def test_a_narrow_capsule_or_rod_may_roll_however_few_pixels_its_bend_covers(radius, yaw):
     for height, names in (
         (objects.capsule(radius), ["rotation"]),
@@ -278,13 +280,12 @@ def test_what_only_the_outline_says_tells_equal_poses_from_others():
 
 def test_another_object_is_not_taken():
     tracker = vts.PoseTracker(press(objects.key(), objects.pose(0.0)), PITCH)
-    for _ in range(2):
-        found = tracker(press(objects.gear(), objects.pose(0.0)))
-        assert found.lost and not found.converged
+    found = tracker(press(objects.gear(), objects.pose(0.0)))
+    assert found.lost and not found.converged
 
 
 def test_a_long_way_takes_keyframes_and_closes_the_loop():
-    way = [0.6 * k for k in range(33)] + [19.2 - 0.6 * k for k in range(1, 33)]
+    way = [0.8 * k for k in range(25)] + [19.2 - 0.8 * k for k in range(1, 25)]
     poses = [objects.pose(0.3 * x, (-x, 0.3 * math.sin(x)), 0.35) for x in way]
     tracker = vts.PoseTracker(press(waves, poses[0]), PITCH)
     drift = []
@@ -574,7 +575,7 @@ def test_a_pose_is_no_more_certain_than_the_way_to_its_keyframe():
 def test_the_stated_uncertainty_is_that_of_the_errors():
     """Slopes that err alike over a contact, in both frames: the root mean square of error over standard deviation is about 1."""
     ratios = []
-    for seed in (1, 2, 3, 4):
+    for seed in (1, 2):
         unit = tracking.WrongSlopes(_bad(press(objects.gear(), swing(0))), tracking.Noise(0.0, 3.0, 2.5), seed, PITCH)
         tracker = vts.PoseTracker(unit(_bad(press(objects.gear(), swing(0))), 0), PITCH)
         for k in range(1, 13, 2):
@@ -590,7 +591,7 @@ def test_relief_that_shows_nothing_is_named():
     assert {"translation along x", "rotation about z"} <= set(found.ambiguous)
 
 
-@pytest.mark.parametrize("times", [1000.0, 0.001])
+@pytest.mark.parametrize("times", [1000.0, pytest.param(0.001, marks=pytest.mark.long)])
 def test_a_frame_in_another_unit_is_named(times):
     frames = [press(objects.key(), swing(k)) for k in (0, 1)]
     tracker = vts.PoseTracker(frames[0], PITCH)

@@ -5,10 +5,8 @@ import csv
 import itertools
 import json
 import math
-import os
 import re
 import signal
-import subprocess
 import sys
 import threading
 import time
@@ -217,7 +215,7 @@ def hunting(k):
     return 1.0 + 0.35 * math.sin(0.7 * k) - 0.1
 
 
-@pytest.mark.parametrize("brightness", [dimming, hunting])
+@pytest.mark.parametrize("brightness", [pytest.param(dimming, marks=pytest.mark.long), hunting])
 def test_each_frame_is_measured_in_its_own_light(unit, small_press, brightness):
     calibration, camera = unit
     truth = small_press(1.0)
@@ -628,25 +626,35 @@ def unit_file(unit, tmp_path_factory):
     return path
 
 
-def test_the_script_writes_overlay_summary_and_frames(run_stream, unit_file, video, tmp_path):
-    done = run_stream(unit_file, video, "--out", tmp_path, "--video", "avi")
+@pytest.fixture(scope="module")
+def commands(run_script, unit_file, video, tmp_path_factory):
+    """What stream, track and reconstruct print and write of the video: name -> (how it ended, folder)."""
+    options = {"stream": ("--video", "avi"), "track": ("--video", "none"), "reconstruct": ("--no-pictures",)}
+    folders = {name: tmp_path_factory.mktemp(name) for name in options}
+    return {
+        name: (run_script(name, unit_file, video, "--out", folders[name], *more), folders[name]) for name, more in options.items()
+    }
+
+
+def test_the_script_writes_overlay_summary_and_frames(commands):
+    done, out = commands["stream"]
     assert done.returncode == 0, done.stderr
     assert "35 frames, 0 dropped" in done.stdout and re.search(
         r"^median ms: read [\d.]+, rectify .* write [\d.]+$", done.stdout, re.M
     )
-    assert (tmp_path / "sheet.png").stat().st_size > 10_000
-    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert (out / "sheet.png").stat().st_size > 10_000
+    summary = json.loads((out / "summary.json").read_text())
     assert summary["frames"] == 35 and summary["contact_frames"] == 10 and summary["deepest_mm"] == pytest.approx(1.0, abs=0.1)
     assert {"read", "depth", "draw", "write"} <= set(summary["stages_ms"])
-    assert len((tmp_path / "frames.csv").read_text().splitlines()) == 36
-    assert len(list(vts.frames(tmp_path / "overlay.avi"))) == 35
+    assert len((out / "frames.csv").read_text().splitlines()) == 36
+    assert len(list(vts.frames(out / "overlay.avi"))) == 35
 
 
-def test_track_writes_a_row_for_each_frame_after_the_reference(run_script, unit_file, video, tmp_path):
-    done = run_script("track", unit_file, video, "--out", tmp_path, "--video", "none")
+def test_track_writes_a_row_for_each_frame_after_the_reference(commands):
+    done, out = commands["track"]
     assert done.returncode == 1 and "frame 15: the reference" in done.stdout, done.stderr
     assert "19 frames, 10 lost, 1 keyframe, 0 loops closed" in done.stdout
-    with (tmp_path / "poses.csv").open(newline="") as file:
+    with (out / "poses.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert [int(row["frame"]) for row in rows] == list(range(16, 35))
     assert float(rows[0]["time_s"]) == pytest.approx(16 / 30, abs=1e-5)
@@ -658,22 +666,19 @@ def test_track_writes_a_row_for_each_frame_after_the_reference(run_script, unit_
     assert np.allclose(turns @ turns.transpose(0, 2, 1), np.eye(3), atol=1e-6)
     assert all("rotation about z" in row["ambiguous"] and float(row["std_z_mm"]) > 0 for row in rows[:9])
     assert all(float(row["std_rz_deg"]) > 10.0 for row in rows[:9])  # unknown
-    summary = json.loads((tmp_path / "summary.json").read_text())
+    summary = json.loads((out / "summary.json").read_text())
     expected = {"frames": 19, "lost": 10, "left_out": 0, "converged": 0, "keyframes": 1, "reference_frame": 15, "metric": True}
     assert {name: summary[name] for name in expected} == expected and summary["lost_because"] == {"no contact": 10}
     assert summary["largest_drift_deg"] == 0.0 and sum(summary["unknown_motions"].values()) == 9
 
 
-def test_a_key_of_a_summary_has_one_meaning_in_all_commands(run_script, unit_file, video, tmp_path):
-    for command in ("stream", "track"):
-        given = (unit_file, video, "--out", tmp_path / command, "--video", "none")
-        assert run_script(command, *given).returncode in (0, 1)
-    assert run_script("reconstruct", unit_file, video, "--out", tmp_path / "reconstruct", "--no-pictures").returncode == 0
-    says = {name: json.loads((tmp_path / name / "summary.json").read_text()) for name in ("stream", "track", "reconstruct")}
+def test_a_key_of_a_summary_has_one_meaning_in_all_commands(commands):
+    says = {name: json.loads((out / "summary.json").read_text()) for name, (_, out) in commands.items()}
     tables = {
-        name: len((tmp_path / name / table).read_text().splitlines()) - 1
-        for name, table in (("stream", "frames.csv"), ("track", "poses.csv"), ("reconstruct", "frames.csv"))
+        name: len((out / ("poses.csv" if name == "track" else "frames.csv")).read_text().splitlines()) - 1
+        for name, (_, out) in commands.items()
     }
+    assert commands["reconstruct"][0].returncode == 0
     assert {name: summary["frames"] for name, summary in says.items()} == tables
     shared = {"source", "source_fps", "left_out", "left_out_because", "sensor", "metric", "mm_per_pixel", "calibration_note"}
     counted = {"frames", "lost", "converged", "keyframes"}
@@ -729,39 +734,6 @@ def test_what_came_before_ctrl_c_is_kept(run_stream, unit_file, video, tmp_path,
     assert len(list(vts.frames(tmp_path / "overlay.avi"))) == 20
     assert not list(tmp_path.glob(".overlay*")) and (tmp_path / "summary.json").is_file()
     assert signal.getsignal(number) == before
-
-
-@pytest.mark.long
-@pytest.mark.skipif(sys.platform == "win32", reason="signals")
-@pytest.mark.parametrize("end", [signal.SIGKILL, signal.SIGINT], ids=["killed", "interrupted"])
-def test_a_process_ended_in_the_middle_leaves_a_whole_video_or_none(unit, unit_file, tmp_path, end):
-    _, camera = unit
-    video = write_film(tmp_path / "long.avi", [camera() for _ in range(20)] * 90)  # a minute: it is not over before it is ended
-    out = tmp_path / "out"
-    command = [
-        sys.executable,
-        "-m",
-        "torchvts",
-        "stream",
-        unit_file,
-        video,
-        "--out",
-        out,
-        "--realtime",
-    ]
-    environment = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "WAYLAND_DISPLAY")}
-    process = subprocess.Popen([*map(str, command), "--video", "avi"], stdout=subprocess.PIPE, cwd=ROOT, env=environment, text=True)
-    while process.poll() is None and not any(p.stat().st_size > 20_000 for p in out.glob(".overlay*")):
-        time.sleep(0.05)
-    process.send_signal(end)
-    output, _ = process.communicate()
-    final = out / "overlay.avi"
-    if end == signal.SIGKILL:
-        assert not final.exists()
-        return
-    assert process.returncode == 0 and "interrupted" in output
-    assert 0 < len(list(vts.frames(final))) < 1800
-    assert not list(out.glob(".overlay*")) and (out / "summary.json").is_file()
 
 
 @pytest.mark.filterwarnings("ignore:frame .* could not be seen")

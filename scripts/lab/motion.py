@@ -78,11 +78,12 @@ PAIRS: dict[str, tuple[DottedSkin, Drag, float]] = {
 
 @dataclass
 class Row:
-    """Errors of one way on one pair."""
+    """Errors of one way on one pair: of dots in the image, and of their displacement in mm with its ratio to what is stated."""
 
     pair: str
     way: str
     error_px: list[float] = field(default_factory=list)
+    error_mm: list[float] = field(default_factory=list)
     ratio: list[float] = field(default_factory=list)
     wrong: int = 0
     missing: int = 0
@@ -90,8 +91,8 @@ class Row:
     false: int = 0
     gone: int = 0
 
-    def add(self, error: Array, known: Array, inside: Array, absent: Array, std: Array | None = None) -> None:
-        """Errors (N, 2) px of dots in view; which of them the way says it has found, and which are gone."""
+    def add(self, error: Array, known: Array, inside: Array, absent: Array, in_mm: tuple[Array, Array] | None = None) -> None:
+        """Errors (N, 2) px of dots in view; which of them the way says it has found, and which are gone; errors and stds in mm."""
         there = inside & ~absent
         size = np.linalg.norm(error, axis=1)
         wrong = there & known & (size > WRONG_PX)
@@ -100,12 +101,18 @@ class Row:
         self.gone, self.false = self.gone + int((inside & absent).sum()), self.false + int((inside & absent & known).sum())
         self.wrong += int(wrong.sum())
         self.error_px += error[right].ravel().tolist()
-        if std is not None:
-            self.ratio += np.abs(error[right] / std[right]).ravel().tolist()
+        if in_mm is not None:
+            off, std = in_mm
+            self.error_mm += off[right].ravel().tolist()
+            self.ratio += np.abs(off[right] / std[right]).ravel().tolist()
 
     @property
     def rms_px(self) -> float:
         return float(np.sqrt(np.mean(np.square(self.error_px)))) if self.error_px else float("nan")
+
+    @property
+    def rms_um(self) -> float:
+        return 1e3 * float(np.sqrt(np.mean(np.square(self.error_mm)))) if self.error_mm else float("nan")
 
     def within(self, stds: float) -> float:
         """Share of errors within so many standard deviations."""
@@ -221,6 +228,12 @@ class Unit:
         inside: Array = np.all((place > rim) & (place < most), axis=1)
         return true, place - self.dots, inside
 
+    def errors(self, got: DotMotion, true: Tensor, seen: Array) -> tuple[Array, tuple[Array, Array]]:
+        """Of our motion: errors (N, 2) px in the image, and errors and standard deviations (N, 2) mm of the displacement."""
+        image = (self.motion.px_of(got.displacement_mm)[0] - self.motion.rest_px).double().numpy() - seen
+        off = (got.displacement_mm[0].double() - true)[:, :2].numpy()
+        return image, (off, got.covariance_mm2[0].diagonal(dim1=1, dim2=2)[:, :2].sqrt().numpy())
+
     @property
     def _middle(self) -> Tensor:
         return torch.tensor([(self.skin.width - 1) / 2.0, (self.skin.height - 1) / 2.0], dtype=torch.float64)
@@ -252,9 +265,8 @@ def run_pairs(names: list[str], seeds: int) -> Iterator[Row]:
                 rows[way].add(found - seen, np.asarray(known), inside, absent)
             with torch.no_grad():
                 got = unit.motion(frame[None], off_depth(depth, seed))
-            error, known = (got.displacement_mm[0].double() - true).numpy(), got.seen[0].numpy()
-            std = got.covariance_mm2[0].diagonal(dim1=1, dim2=2).sqrt().numpy() / PITCH
-            rows[OURS].add(error[:, :2] / PITCH, known, inside, absent, std[:, :2])
+            error, in_mm = unit.errors(got, true, seen)
+            rows[OURS].add(error, got.seen[0].numpy(), inside, absent, in_mm)
         yield from rows.values()
 
 
@@ -365,9 +377,8 @@ def run_film(frames: int, gone: float) -> Iterator[Row]:
             rows[way].add(found - seen, ~np.isnan(found).any(1), inside, absent)
         with torch.no_grad():
             last = unit.motion(frame[None], skin.depth_mm(moved).float(), last)
-        std = last.covariance_mm2[0].diagonal(dim1=1, dim2=2).sqrt().numpy() / PITCH
-        error = (last.displacement_mm[0].double() - true).numpy() / PITCH
-        rows[OURS].add(error[:, :2], last.seen[0].numpy(), inside, absent, std[:, :2])
+        error, in_mm = unit.errors(last, true, seen)
+        rows[OURS].add(error, last.seen[0].numpy(), inside, absent, in_mm)
         before = frame
     yield from rows.values()
 
@@ -505,15 +516,13 @@ def pairs_table(rows: list[Row]) -> str:
             text += f", {row.false} of {row.gone} gone seen" if row.gone else ""
             cells.append(text)
         ours = here[OURS]
-        lines.append(
-            f"| {pair} | {' | '.join(cells)} | {1e3 * PITCH * ours.rms_px:.2f} | {ours.within(1.0):.2f}, {ours.within(2.0):.2f} |"
-        )
+        lines.append(f"| {pair} | {' | '.join(cells)} | {ours.rms_um:.2f} | {ours.within(1.0):.2f}, {ours.within(2.0):.2f} |")
     return "\n".join(lines)
 
 
 def to_json(rows: list[Any]) -> str:
     """The rows without their single errors."""
-    drop = ("error_px", "ratio")
+    drop = ("error_px", "error_mm", "ratio")
     return json.dumps(
         [
             {k: v for k, v in vars(row).items() if k not in drop} | ({"rms_px": row.rms_px} if isinstance(row, Row) else {})

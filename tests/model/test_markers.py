@@ -6,7 +6,7 @@ import torch
 from torch import nn
 
 import torchvts as vts
-from torchvts.model.markers import FillMarkers, fill_markers, find_markers, is_printed, marker_diameter_px
+from torchvts.model.markers import FillMarkers, fill_markers, find_markers, is_printed
 from torchvts.model.response_field import ResponseField, ResponseModel
 
 HEIGHT, WIDTH, PITCH, NOISE = 200, 264, 0.1, 0.004
@@ -146,10 +146,9 @@ def test_the_diameter_need_not_be_exact(diameter_px):
 @pytest.mark.parametrize("scale", [1, 2, 3])
 def test_the_diameter_comes_from_the_background(scale):
     background = nn.functional.interpolate(frame(noise=0.0)[0], scale_factor=scale, mode="bilinear")[0]
-    diameter_px, contrast = marker_diameter_px(background)
-    assert abs(diameter_px - 7.5 * scale) <= scale  # an ellipse of 9 x 6 px with soft edges
-    assert 0.4 < contrast < 0.6
     block = FillMarkers.from_background(background)
+    assert abs(block.diameter_px - 7.5 * scale) <= scale  # an ellipse of 9 x 6 px with soft edges
+    assert 0.08 < block.contrast < 0.12  # a fifth of the dots'
     rest = block(background[None])
     assert not bool(find_markers(rest, block.diameter_px, block.contrast).any())
 

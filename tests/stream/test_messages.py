@@ -31,6 +31,17 @@ def frame(ring, small_sensor, small_press):
         return TactileFrame(7, 0.25, image[0], pipe(image))
 
 
+@pytest.fixture(scope="module")
+def dragged():
+    """A skin with dots that is dragged, as a stream gives it, and the module that follows them."""
+    skin, drag = vts.scenes.DottedSkin(120, 160, 0.125), vts.scenes.Drag(shift_mm=(0.3, -0.2), press_mm=0.5)
+    calibration = vts.Calibration.from_lights(skin.lights, vts.Sensor("rig", 120, 160, 0.125), skin.image())
+    image = skin.image(drag)
+    with torch.inference_mode():
+        frame = TactileFrame(7, 0.25, image, vts.DepthPipeline.from_calibration(calibration)(image[None]))
+    return frame, vts.SkinMotion.from_calibration(calibration)
+
+
 def as_ros(record):
     """A record as ROS's own type of message, whose constructor takes no other fields."""
     if isinstance(record, messages.Header):
@@ -120,6 +131,23 @@ def test_no_contact_is_an_empty_cloud(frame):
     assert messages.lerobot_frame(frame._replace(output=nothing), PITCH)["observation.tactile.state"][0] == 0.0
 
 
+def test_the_dots_message_says_where_each_dot_is_and_how_far_it_has_moved(dragged):
+    frame, motion = dragged
+    moved = motion(frame.image[None], frame.output.depth_mm)
+    message = messages.dots_message(frame, moved, "finger")
+    kind = ROS_TYPES[messages.CloudMessage]
+    read = ROS.deserialize_cdr(ROS.serialize_cdr(as_ros(message), kind), kind)
+    assert read.width == len(moved.rest_mm) and read.is_dense == bool(moved.seen.all())
+    cloud = cloud_of(message)
+    seen = moved.seen[0].numpy()
+    assert np.array_equal(~np.isnan(cloud["dx"]), seen) and seen.sum() > 0
+    middle = int(moved.rest_mm.norm(dim=1).argmin())
+    point = [1e3 * float(cloud[name][middle]) for name in messages.DOT_FIELDS]
+    x, y = moved.rest_mm[middle].tolist()
+    assert point[3:5] == pytest.approx([0.3, 0.2], abs=0.02)  # image y down, point y up
+    assert point[:2] == pytest.approx([x + point[3], -y + point[4]], abs=1e-5) and point[2] == point[5] > 0.3
+
+
 class CheckedDataset:
     """Accepts frames as LeRobot's ``add_frame`` does: all features and a task, each array of its dtype and shape."""
 
@@ -162,6 +190,19 @@ def test_an_episode_has_the_features_of_its_data_set(frame, small_sensor):
     np.testing.assert_allclose(1e3 * depth_m[..., 0], later.output.depth_mm[0, 0].numpy(), rtol=1e-6)
 
 
+def test_an_episode_keeps_the_motion_of_dots(dragged):
+    frame, motion = dragged
+    sensor, dots = vts.Sensor("rig", 120, 160, 0.125), len(motion.rest_px)
+    dataset = CheckedDataset(messages.lerobot_features(sensor, image_dtype="image", dots=dots))
+    assert messages.record_episode([frame, frame], 0.125, dataset, "drag", motion=motion) == 2
+    first = motion(frame.image[None], frame.output.depth_mm)
+    second = motion(frame.image[None], frame.output.depth_mm, first)
+    for kept, moved in zip(dataset.frames, (first, second)):
+        values = kept["observation.tactile.dots"]
+        np.testing.assert_array_equal(values[:, :3], moved.displacement_mm[0].detach().numpy())
+        np.testing.assert_array_equal(values[:, 3] > 0.5, moved.seen[0].numpy())
+
+
 @pytest.mark.parametrize(
     ("call", "message"),
     [
@@ -170,6 +211,7 @@ def test_an_episode_has_the_features_of_its_data_set(frame, small_sensor):
         (lambda frame: messages.header(frame, "finger", start_s=-1.0), "start_s: expected frame 7 at 0 s or later, got -0.75"),
         (lambda frame: messages.header(frame, "finger", start_s=float("inf")), "start_s: expected"),
         (lambda frame: messages.lerobot_features(vts.Sensor("rig", 8, 8, 0.1), image_dtype="png"), "image_dtype: expected"),
+        (lambda frame: messages.lerobot_features(vts.Sensor("rig", 8, 8, 0.1), dots=-1), "dots: expected"),
     ],
 )
 def test_bad_values_are_named(frame, call, message):

@@ -30,12 +30,11 @@ def find_markers(
     r"""Find the pixels of printed markers: small, roundish, darker than their surroundings in all channels. Scripts.
 
     On log light, take the mean of the two pixels ``diameter_px`` away on either side, minus the pixel itself: a ramp cancels,
-    however steep. The smallest value over four directions is a channel's marker depth, because a line or rim is not darker than
-    what follows along it; a step, which is dark on one side only, has none. A marker is where the least of the three channels
-    reaches ``contrast`` and ``sigmas`` times the noise of the frame (shading darkens some channels, not all). The shading of a
-    contact may hide a marker in one channel. In a frame with other markers the mean of the channels then decides, with at least
-    twice that depth and 0.4 of the frame's usual depth. Pixels nearby that are darker than a first filling belong to the marker,
-    and the mask grows by ``margin``.
+    however steep. The least over four directions is a channel's marker depth: a line or rim is not darker than what follows along
+    it, and a step is dark on one side only. A marker is where the least of the three channels reaches ``contrast`` and ``sigmas``
+    times the noise of the frame. The shading of a contact may hide it in one channel: in a frame with other markers the mean of the
+    channels then decides, with at least twice that depth and 0.4 of the frame's usual one. Pixels nearby that are darker than a
+    first filling belong to the marker, and the mask grows by ``margin``.
 
     Args:
         image: (B, 3, H, W) in [0, 1], camera values or linear light.
@@ -135,8 +134,11 @@ def fill_markers(image: Tensor, mask: Tensor, relaxations: int = 4) -> Tensor:
     return value
 
 
+FEWEST_DOTS = 8
+"""Dots that a skin has at least; fewer are dust."""
+
 LEAST_PRINTED = 20
-"""Dots that a printed pattern has at least; a Wedge's housing shows 10, a worn skin 7, patterns 63 and more."""
+"""Dots that a pattern has at least of which nothing is said; a Wedge's housing shows 10, a worn skin 7, patterns 63 and more."""
 
 REGULAR = 0.75
 """Share of them that lie as far from their nearest neighbour as usual, within a fifth: 0.88 and more of patterns."""
@@ -153,18 +155,12 @@ def find_dots(background: Tensor, markers: "FillMarkers") -> Tensor:
         >>> find_dots(image, FillMarkers()).round(decimals=3)
         tensor([[33., 23.]], dtype=torch.float64)
     """
-    import cv2
-
     if markers.diameter_px == 0.0:
         return torch.zeros(0, 2, dtype=torch.float64)
     found = find_markers(background[None], markers.diameter_px, markers.contrast, markers.sigmas, markers.margin)
-    count, label, stats, _ = cv2.connectedComponentsWithStats(found[0, 0].cpu().numpy().astype(np.uint8))
-    light = torch.log(background.detach().cpu().double() + 0.03).mean(0)
-    dark = (fill_markers(light[None, None], found.cpu())[0, 0] - light).clamp_min(1e-6)
-    y, x = torch.meshgrid(torch.arange(light.shape[0]), torch.arange(light.shape[1]), indexing="ij")
-    sums = [torch.bincount(torch.from_numpy(label).long().flatten(), (dark * of).flatten(), count)[1:] for of in (x, y, 1.0)]
-    size = torch.from_numpy(stats[1:, cv2.CC_STAT_AREA]).double()
-    return torch.stack((sums[0] / sums[2], sums[1] / sums[2]), 1)[size > 0.3 * size.median() if len(size) else size > 0]
+    light = _log_light(background[None].detach().double(), 1).mean(1, keepdim=True)
+    place, area, _, _ = _blobs(found, fill_markers(light, found) - light)
+    return place[area > 0.3 * area.median()] if len(area) else place
 
 
 def is_printed(background: Tensor, markers: "FillMarkers") -> bool:
@@ -210,22 +206,44 @@ class FillMarkers(nn.Module):
 
     @classmethod
     def from_background(
-        cls, background: Tensor, contrast: float = 0.06, least_markers: int = 8, margin: float = 0.2
+        cls, background: Tensor, contrast: float = 0.06, least_markers: int = FEWEST_DOTS, margin: float = 0.2
     ) -> "FillMarkers":
         """Make the block for a unit.
 
-        ``diameter_px`` comes from :func:`marker_diameter_px`. The contrast is a fifth of that of the markers, without the
-        faintest twentieth of them, and at least ``contrast``.
+        The reach at which most is found dark shows the markers completely; the 90th percentile of their longer sides there is the
+        diameter. The contrast is a fifth of the 5th percentile of their depths, and at least ``contrast``.
 
         Args:
-            background: (3, H, W), image without contact.
-            contrast: least depth of a marker.
+            background: (3, H, W) in [0, 1], image without contact.
+            contrast: least depth of a marker, as the logarithm of value.
             least_markers: fewer are taken for dust, and nothing is filled.
             margin: as for :func:`find_markers`.
+        Example:
+            >>> FillMarkers.from_background(torch.full((3, 64, 64), 0.5)).diameter_px
+            0.0
         """
-        margin = check_positive("margin", margin, 2.0)
-        diameter_px, found = marker_diameter_px(background, contrast, least_markers)
-        return cls(diameter_px, max(contrast, found / 5.0), margin=margin)
+        check_field("background", background)
+        check_range("background", background)
+        check_positive("contrast", contrast), check_integer("least_markers", least_markers, 1)
+        none = cls(0.0, contrast, margin=margin)
+        light, diameter, best = _log_light(background[None], 1), 0.0, 0.0
+        reach = 3.0
+        while reach < min(background.shape[1:]) / 8.0:
+            depth, _, least = _marker_depth(light, reach, contrast, none.sigmas)
+            found = float(torch.where(depth > least, depth, 0.0).sum())
+            if found > 1.1 * best:  # a longer reach must find clearly more, because it includes neighbours
+                diameter, best = reach, found
+            reach *= 1.15
+        if diameter == 0.0:
+            return none
+        for _ in range(2):  # the reach is the diameter, so repeat with the measured one
+            strict, mean, least = _marker_depth(light, diameter, contrast, none.sigmas)
+            peak = _square_max(torch.where(strict > least, mean, 0.0), max(1, math.ceil(0.5 * diameter)))
+            _, _, side, largest = _blobs((peak > 0) & (mean > 0.5 * peak), mean)
+            if len(side) < least_markers:
+                return none
+            diameter = float(side.quantile(0.9))
+        return cls(diameter, max(contrast, float(largest.quantile(0.05)) / 5.0), margin=margin)
 
     def forward(self, image: Tensor) -> Tensor:
         """(B, 3, H, W) to (B, 3, H, W)."""
@@ -252,48 +270,7 @@ class FillMarkers(nn.Module):
             raise ValueError(f"{source}: {error}") from error
 
     def extra_repr(self) -> str:
-        return (
-            f"diameter_px={self.diameter_px:.3g}, contrast={self.contrast:.3g}, sigmas={self.sigmas:.3g}, margin={self.margin:.3g}"
-        )
-
-
-def marker_diameter_px(background: Tensor, contrast: float = 0.06, least_markers: int = 8) -> tuple[float, float]:
-    """Size and contrast of the markers of a skin.
-
-    The reach at which most is found dark shows the markers completely. The 90th percentile of the longer sides of their bounding
-    boxes is the diameter, the 5th percentile of their depths the contrast.
-
-    Args:
-        background: (3, H, W) in [0, 1], without contact.
-        contrast: least depth of a marker, as the logarithm of value.
-        least_markers: fewer count as none.
-    Returns:
-        diameter_px and contrast (logarithm of value); both 0 if there are no markers.
-    Example:
-        >>> marker_diameter_px(torch.full((3, 64, 64), 0.5))
-        (0.0, 0.0)
-    """
-    check_field("background", background)
-    check_range("background", background)
-    check_positive("contrast", contrast), check_integer("least_markers", least_markers, 1)
-    light, diameter, best = _log_light(background[None], 1), 0.0, 0.0
-    reach = 3.0
-    while reach < min(background.shape[1:]) / 8.0:
-        depth, _, least = _marker_depth(light, reach, contrast, 5.0)
-        found = float(torch.where(depth > least, depth, 0.0).sum())
-        if found > 1.1 * best:  # a longer reach must find clearly more, because it includes neighbours
-            diameter, best = reach, found
-        reach *= 1.15
-    if diameter == 0.0:
-        return 0.0, 0.0
-    for _ in range(2):  # the reach is the diameter, so repeat with the measured one
-        strict, mean, least = _marker_depth(light, diameter, contrast, 5.0)
-        peak = _square_max(torch.where(strict > least, mean, 0.0), max(1, math.ceil(0.5 * diameter)))
-        side, depth = _blobs(((peak > 0) & (mean > 0.5 * peak))[0, 0], mean[0, 0])
-        if len(side) < least_markers:
-            return 0.0, 0.0
-        diameter = float(side.quantile(0.9))
-    return diameter, float(depth.quantile(0.05))
+        return ", ".join(f"{name}={value:.3g}" for name, value in self.to_dict().items())
 
 
 def _log_light(image: Tensor, cell: int) -> Tensor:
@@ -365,11 +342,15 @@ def _neighbour_mean(image: Tensor) -> Tensor:
     return 0.25 * (across + wide[:, :, :-2, 1:-1] + wide[:, :, 2:, 1:-1])
 
 
-def _blobs(mask: Tensor, value: Tensor) -> tuple[Tensor, Tensor]:
-    """Longer side in pixels and largest value of each connected blob (corners connect) of an (H, W) mask, (N,) each."""
+def _blobs(mask: Tensor, value: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Place (N, 2) weighed by value, area, longer side, px, and largest value of the parts of a mask (1, 1, H, W)."""
     import cv2
 
-    number, label, stats, _ = cv2.connectedComponentsWithStats(mask.cpu().numpy().astype(np.uint8), connectivity=8)
-    sides = torch.from_numpy(stats[1:, [cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT]]).amax(1).to(value)
-    blob = torch.from_numpy(label).long().to(value.device)[mask]
-    return sides, torch.zeros(number, dtype=value.dtype, device=value.device).scatter_reduce(0, blob, value[mask], "amax")[1:]
+    mask, value = mask[0, 0].cpu(), value[0, 0].cpu()
+    number, label, stats, _ = cv2.connectedComponentsWithStats(mask.numpy().astype(np.uint8))
+    blob, weight = torch.from_numpy(label).long()[mask], value[mask].clamp_min(1e-6)
+    y, x = mask.nonzero().to(weight.dtype).T
+    total, across, down = (torch.bincount(blob, weight * of, number)[1:] for of in (torch.ones_like(x), x, y))
+    width, height, area = torch.from_numpy(stats[1:, 2:]).to(weight.dtype).T
+    largest = torch.zeros(number, dtype=weight.dtype).scatter_reduce(0, blob, weight, "amax")[1:]
+    return torch.stack((across / total, down / total), 1), area, torch.maximum(width, height), largest

@@ -11,9 +11,6 @@ from ..core.checks import check_batch, check_mask, check_same_size
 LENGTHS = (1.5, 2.2, 3.2, 4.6, 7.0)
 """Lengths of the field, in spacings of the dots, of which the likeliest is taken."""
 
-STRENGTHS = (0.7, 1.0, 1.6, 2.5, 4.0)
-"""Strengths of the field, in root mean squares of the displacements, likewise."""
-
 LEAST_MM = 1e-4
 """Least strength of a field, and least standard deviation of a dot."""
 
@@ -71,48 +68,27 @@ class DotMotion(NamedTuple):
         Source:
             Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, eq. 2.25, 2.26, 4.17 and 5.8.
         """
-        step = max(1.0, self.spacing_mm() / self.mm_per_pixel / STEPS)
-        x, y = (self._grid(size, step) for size in (self.width, self.height))
-        places = torch.stack((x.expand(len(y), -1), y[:, None].expand(-1, len(x))), -1).reshape(-1, 2)
-        mean, variance = self.at(places)
+        x, y = self._grid()
+        mean, variance = self.at(torch.cartesian_prod(y, x).flip(1))
         both = torch.cat((mean, variance.sqrt()), -1).mT.reshape(-1, 6, len(y), len(x))
         both = nn.functional.interpolate(both, (self.height, self.width), mode="bilinear", align_corners=True)
         return both[:, :3], both[:, 3:]
 
     def at(self, places_mm: Tensor) -> tuple[Tensor, Tensor]:
         """The field at places of the skin at rest (M, 2), mm: displacement (B, M, 3) and its variance, mm^2, likewise."""
-        spacing, values = self.spacing_mm(), self.displacement_mm.double().mT  # (B, 3, N)
-        seen = self.seen[:, None]
-        noise = self.covariance_mm2.detach().double().diagonal(dim1=2, dim2=3).mT
-        noise = torch.where(seen, noise, 0.0).clamp_min(LEAST_MM**2)
-        rest = self.rest_mm.detach().double()
+        spacing, rest, known = self.spacing_mm(), self.rest_mm.detach().double(), self.seen[:, None].double()  # (B, 1, N)
         apart, far = torch.cdist(rest, rest) / spacing, torch.cdist(places_mm.double(), rest) / spacing
-        values = torch.where(seen, values, 0.0)
-        both = (seen & seen.mT).to(values.dtype)[:, None]
-        count = seen.sum(-1, keepdim=True).clamp_min(1).to(values.dtype)
-        size = (values.detach().square().sum(-1, keepdim=True) / count).sqrt()
-        size = torch.cat((size[:, :2].square().mean(1, keepdim=True).sqrt().expand(-1, 2, -1), size[:, 2:]), 1)  # x and y alike
-        best: list[Tensor] = []
-        for length in LENGTHS:
-            kernel = matern(apart / length)
-            for strength in STRENGTHS:
-                power = ((strength * size).clamp_min(LEAST_MM).square())[..., None]  # (B, 3, 1, 1)
-                with torch.no_grad():
-                    cholesky = torch.linalg.cholesky(power * kernel * both + torch.diag_embed(noise))
-                    whitened = torch.linalg.solve_triangular(cholesky, values[..., None], upper=False)[..., 0]
-                    cost = whitened.square().sum(-1) + 2.0 * cholesky.diagonal(dim1=2, dim2=3).log().sum(-1)
-                    cost = torch.cat((cost[:, :2].sum(1, keepdim=True).expand(-1, 2), cost[:, 2:]), 1)
-                    better = torch.ones_like(cost) > 0.0 if not best else cost < best[0]
-                chosen = [cost, power.expand(-1, 3, -1, -1), torch.full_like(cost, length)]
-                best = chosen if not best else [_where(better, one, other) for one, other in zip(chosen, best, strict=True)]
-        _, power, lengths = best
-        lengths = lengths[..., None, None]
-        system = power * matern(apart / lengths) * both + torch.diag_embed(noise)
-        cross = power * matern(far / lengths) * seen[:, :, None].to(values.dtype)  # (B, 3, M, N)
-        cholesky = torch.linalg.cholesky(system)
+        values, both = self.displacement_mm.double().mT * known, known[..., None] * known[..., None, :]  # (B, 3, N)
+        noise = self.covariance_mm2.detach().double().diagonal(dim1=2, dim2=3).mT.clamp_min(LEAST_MM**2)
+        fits = [_likelihood(matern(apart / length) * both, values.detach(), noise) for length in LENGTHS]
+        costs, powers = (torch.stack(part) for part in zip(*fits, strict=True))
+        best = costs.argmin(dim=0, keepdim=True)  # (1, B, 3)
+        power, lengths = powers.gather(0, best)[0, ..., None, None], values.new_tensor(LENGTHS)[best[0]][..., None, None]
+        cholesky = torch.linalg.cholesky(power * matern(apart / lengths) * both + torch.diag_embed(noise))
+        cross = power * matern(far / lengths) * known[:, :, None]  # (B, 3, M, N)
         mean = (cross @ torch.cholesky_solve(values[..., None], cholesky))[..., 0]
-        known = torch.linalg.solve_triangular(cholesky, cross.mT, upper=False).square().sum(-2)
-        variance = (power[..., 0] - known).clamp_min(0.0)
+        told = torch.linalg.solve_triangular(cholesky, cross.mT, upper=False).square().sum(-2)
+        variance = (power[..., 0] - told).clamp_min(0.0)
         return mean.mT.to(self.displacement_mm.dtype), variance.mT.to(self.displacement_mm.dtype)
 
     def slip(self, contact: Tensor) -> Slip:
@@ -133,9 +109,8 @@ class DotMotion(NamedTuple):
             raise ValueError(
                 f"contact: expected {len(self.seen)} frames like the motion, got {contact.shape[0]}: of another batch?"
             )
-        step = max(1.0, self.spacing_mm() / self.mm_per_pixel / STEPS)
-        x, y = (self._grid(size, step) for size in (self.width, self.height))
-        places = torch.stack((x.expand(len(y), -1), y[:, None].expand(-1, len(x))), -1).reshape(-1, 2)
+        x, y = self._grid()
+        places = torch.cartesian_prod(y, x).flip(1)
         mean, variance = self.at(places)
         inside = self._under(contact, places + mean[..., :2]) & (mean[..., 2] > 0.0)
         turns = self._turns(mean[..., :2].reshape(-1, len(y), len(x), 2), x, y).flatten(1)
@@ -155,10 +130,12 @@ class DotMotion(NamedTuple):
         apart = torch.cdist(self.rest_mm, self.rest_mm)
         return float(apart.topk(2, largest=False).values[:, 1].median())
 
-    def _grid(self, size: int, step: float) -> Tensor:
-        """Places along a side of the image, mm, about ``step`` pixels apart, the first and last pixels among them."""
-        half = 0.5 * (size - 1.0) * self.mm_per_pixel
-        return torch.linspace(-half, half, math.ceil((size - 1.0) / step) + 1, dtype=self.rest_mm.dtype, device=self.rest_mm.device)
+    def _grid(self) -> tuple[Tensor, Tensor]:
+        """x and y of a grid over the image, mm, a share of the dots' spacing apart, the first and last pixels on it."""
+        step = max(1.0, self.spacing_mm() / self.mm_per_pixel / STEPS)
+        sides = [(0.5 * (size - 1.0) * self.mm_per_pixel, math.ceil((size - 1.0) / step) + 1) for size in (self.width, self.height)]
+        x, y = (torch.linspace(-half, half, n, dtype=self.rest_mm.dtype, device=self.rest_mm.device) for half, n in sides)
+        return x, y
 
     def _under(self, contact: Tensor, places_mm: Tensor) -> Tensor:
         """Whether places (B, M, 2) of the image are in contact, (B, M) bool."""
@@ -214,5 +191,18 @@ def matern(r: Tensor) -> Tensor:
     return (1.0 + r + r * r / 3.0) * torch.exp(-r)
 
 
-def _where(better: Tensor, one: Tensor, other: Tensor) -> Tensor:
-    return torch.where(better.reshape(better.shape + (1,) * (one.dim() - 2)), one, other)
+def _likelihood(kernel: Tensor, values: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
+    """Cost of a field with a kernel (B, 1, N, N) through values (B, 3, N), noise likewise, and the strength that fits them best.
+
+    Both are (B, 3), those of x and y alike; the cost is minus twice the logarithm of the likelihood, the strength a variance, mm^2.
+    """
+    count = kernel.diagonal(dim1=2, dim2=3).sum(-1).clamp_min(1.0)  # (B, 1)
+    power, cost = torch.ones_like(values[..., 0]), torch.zeros_like(values[..., 0])
+    for _ in range(3):
+        cholesky = torch.linalg.cholesky(power[..., None, None] * kernel + torch.diag_embed(noise))
+        whitened = torch.linalg.solve_triangular(cholesky, values[..., None], upper=False)[..., 0]
+        larger = whitened.square().sum(-1) / count
+        larger = torch.cat((larger[:, :2].mean(1, keepdim=True).expand(-1, 2), larger[:, 2:]), 1).clamp_min(1e-6)
+        cost = count * larger.log() + 2.0 * cholesky.diagonal(dim1=2, dim2=3).log().sum(-1)
+        power = (power * larger).clamp_min(LEAST_MM**2)
+    return torch.cat((cost[:, :2].sum(1, keepdim=True).expand(-1, 2), cost[:, 2:]), 1), power

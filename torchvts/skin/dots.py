@@ -1,17 +1,12 @@
 """Where printed dots of a background are in a frame: a dot's surroundings are its template, and the frame is regressed on it."""
 
-from typing import NamedTuple
-
 import torch
 from torch import Tensor, nn
 
 from ..core.blur import blur, gaussian_weights
 
-LEAST_LEFT = 0.35
-"""A dot with less than this share of its darkness is not seen."""
-
-LEAST_EXPLAINED = 0.4
-"""Least share of what a patch holds beside a parabola of light that its dot explains."""
+LEAST_LEFT = 0.25
+"""A dot is seen by so much of its darkness at least, beyond what its patch holds else."""
 
 RIDGE = 1e-6
 """Of the regression, relative: a dot that is a line says nothing of motion along it."""
@@ -27,14 +22,6 @@ STRIDE = 1.5
 
 STEPS, SETTLED_PX = 6, 0.005
 """Steps of a search at most; it ends with one that moves no dot further."""
-
-
-class Settled(NamedTuple):
-    """Dots of frames: place (B, N, 2) px, its covariance (B, N, 2, 2) px^2, and whether they are there, (B, N) bool."""
-
-    place: Tensor
-    covariance: Tensor
-    there: Tensor
 
 
 class DotTemplates(nn.Module):
@@ -62,12 +49,13 @@ class DotTemplates(nn.Module):
     matrix: Tensor
     unit_covariance: Tensor
     unit_residual: Tensor
+    darkness: Tensor
     by_bend: Tensor
 
     def __init__(self, grey: Tensor, dots_px: Tensor, half_px: float, cell: int, blur_px: float) -> None:
         super().__init__()
         self.cell, self.weights = cell, gaussian_weights(blur_px / cell)
-        self.least_left, self.least_explained, self.steps = LEAST_LEFT, LEAST_EXPLAINED, STEPS
+        self.least_left, self.steps = LEAST_LEFT, STEPS
         self.difference_px, self.settled_px = DIFFERENCE_PX, SETTLED_PX
         variance = blur_px**2 + SPLINE_VARIANCE * cell**2
         step = max(float(cell), min(STRIDE * variance**0.5, half_px / 4.0))
@@ -99,8 +87,8 @@ class DotTemplates(nn.Module):
         covariance = shares @ matrix.mT
         residual = window.sum() - 2.0 * (shares * weighed.mT).sum((1, 2)) + (normal * covariance).sum((1, 2))
         by_bend = torch.einsum("nkp,npj,pq->nkjq", matrix[:, :2], slope, quadratic(patch))
-        buffers = {"weight": weight[..., 0], "columns": columns, "matrix": matrix, "unit_residual": residual, "by_bend": by_bend}
-        for name, value in (buffers | {"unit_covariance": covariance[:, :2, :2]}).items():
+        buffers = {"weight": weight[..., 0], "columns": columns, "matrix": matrix, "by_bend": by_bend, "unit_residual": residual}
+        for name, value in (buffers | {"unit_covariance": covariance[:, :2, :2], "darkness": normal[:, 2, 2]}).items():
             self.register_buffer(name, value.to(grey.dtype))
 
     def prepare(self, grey: Tensor) -> Tensor:
@@ -122,18 +110,18 @@ class DotTemplates(nn.Module):
                 break
             values = self.read(level, self.in_cells(place[:, :, None] + self.patch))
             fit = self.fit(values)
-        return place, (fit[..., 2] > self.least_left) & (self.residual(values, fit)[1] > self.least_explained)
+        return place, self.left(values, fit)[0] > self.least_left
 
     def step(self, level: Tensor, place: Tensor, around: Tensor, warp: Tensor) -> Tensor:
         """Places (B, N, 2) px after a step by the templates' derivatives; patches (B, N, P, 2) px are warped by (B, N, 2, 2)."""
         fit = self.fit(self.sample(level, place[:, :, None] + around))
         return place - (warp @ fit[..., :2, None])[..., 0] / fit[..., 2:3].clamp_min(self.least_left)
 
-    def settle(self, level: Tensor, place: Tensor, around: Tensor, most_px: float) -> Settled:
-        """A step by the frame's own derivatives, of patches (B, N, P, 2) px; its gradient is that of the place where steps end.
+    def settle(self, level: Tensor, place: Tensor, around: Tensor, most_px: float) -> tuple[Tensor, Tensor, Tensor]:
+        """Places (B, N, 2) px after a step by the frame's own derivatives, their covariance px^2, and whether the dots are there.
 
-        Where the shares of the derivatives are zero, their change by the frame is their change by the place, times minus one, times
-        the motion (implicit function theorem).
+        Patches are (B, N, P, 2) px. The gradient is that of the place where steps end: where the shares of the derivatives are
+        zero, their change by the frame is minus their change by the place, times the motion (implicit function theorem).
         """
         places = place[:, :, None] + around
         values = self.sample(level, places)
@@ -142,20 +130,18 @@ class DotTemplates(nn.Module):
         ahead = [self.fit(self.sample(level.detach(), places.detach() + one))[..., :2] for one in along]
         by_place = (torch.stack(ahead, -1) - fit.detach()[..., :2, None]) / self.difference_px  # (B, N, 2, 2)
         determinant = by_place[..., 0, 0] * by_place[..., 1, 1] - by_place[..., 0, 1] * by_place[..., 1, 0]
-        squares, explained = self.residual(values.detach(), fit.detach())
-        there = (fit[..., 2] > self.least_left) & (explained > self.least_explained) & (determinant > 0.1 * self.least_left**2)
+        left, squares = self.left(values.detach(), fit.detach())
+        there = (left > self.least_left) & (determinant > 0.1 * self.least_left**2)
         adjugate = torch.stack((by_place[..., 1, 1], -by_place[..., 0, 1], -by_place[..., 1, 0], by_place[..., 0, 0]), -1)
         inverse = adjugate.reshape(by_place.shape) / torch.where(there, determinant, 1.0)[..., None, None]
         change = torch.where(there[..., None], -(inverse @ fit[..., :2, None])[..., 0], 0.0).clamp(-most_px, most_px)
         variance = (squares / self.unit_residual)[..., None, None]
-        return Settled(place + change, variance * (inverse @ self.unit_covariance @ inverse.mT), there)
+        return place + change, variance * (inverse @ self.unit_covariance @ inverse.mT), there
 
-    def residual(self, values: Tensor, fit: Tensor) -> tuple[Tensor, Tensor]:
-        """Weighted squares (B, N) of what patches (B, N, P) hold beside the fit, and the share (B, N) that the dot explains."""
-        without_dot = values - (self.columns[..., 3:9] @ fit[..., 3:9, None])[..., 0]
-        missed = (values - (self.columns @ fit[..., None])[..., 0]).square()
-        squares = (self.weight * missed).sum(-1)
-        return squares, 1.0 - squares / (self.weight * without_dot.square()).sum(-1).clamp_min(1e-12)
+    def left(self, values: Tensor, fit: Tensor) -> tuple[Tensor, Tensor]:
+        """Share (B, N) that is left of dots, less what patches (B, N, P) hold beside the fit, and the weighted squares of this."""
+        squares = (self.weight * (values - (self.columns @ fit[..., None])[..., 0]).square()).sum(-1)
+        return fit[..., 2] - (squares / self.darkness).sqrt(), squares
 
     def fit(self, values: Tensor) -> Tensor:
         """Shares of the columns (B, N, 16) in patches (B, N, P)."""

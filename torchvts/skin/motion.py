@@ -20,7 +20,7 @@ from ..core.checks import (
 )
 from ..core.geometry import gradient_of_depth
 from ..model.calibration import Calibration, check_calibration
-from ..model.markers import find_dots
+from ..model.markers import FEWEST_DOTS, find_dots
 from .dot_motion import DotMotion, matern
 from .dots import DotTemplates, quadratic
 
@@ -33,20 +33,11 @@ PATCH = 1.4
 COARSE_PATCH = 0.55
 """Half a patch of the first level, in spacings."""
 
-FEWEST = 8
-"""Dots that a skin has at least; fewer are dust."""
-
-REACH = 0.8
-"""Of the dots around a dot, in spacings."""
-
-LEAST_AROUND = 0.03
-"""A dot's neighbours have so much of a Gaussian of this reach: the two rings around it."""
-
-KNOWN = 0.3
-"""Variance of a place that others tell, in units of the process."""
+REACH = 1.6
+"""Of the dots beside a dot, in spacings."""
 
 AGREES = 0.3
-"""A dot that differs by so many spacings from what its neighbours expect is another."""
+"""A dot that has moved otherwise than its neighbours by so many spacings is another dot; less where they tell less."""
 
 ROUNDS = 12
 """Rings of dots that are found one after another where there is no frame before."""
@@ -93,9 +84,10 @@ class SkinMotion(nn.Module):
         the regression is that of :class:`~torchvts.skin.dots.DotTemplates`; the rest is this project's.
     """
 
+    middle_px: Tensor
     rest_px: Tensor
+    rest_mm: Tensor
     camera: Tensor
-    around: Tensor
     beside: Tensor
     terms: Tensor
     alike: Tensor
@@ -123,24 +115,25 @@ class SkinMotion(nn.Module):
         rim = 0.5 * self.diameter_px
         most = dots_px.new_tensor([self.width - 1.0, self.height - 1.0]) - rim
         dots = dots_px[((dots_px > rim) & (dots_px < most)).all(dim=1)].to(background.dtype)
-        if len(dots) < FEWEST:
+        if len(dots) < FEWEST_DOTS:
             raise ValueError(
-                f"background: expected a skin with at least {FEWEST} printed dots that lie wholly in view, got {len(dots)}: a skin "
-                "without dots shows no motion that could be told from a change of light"
+                f"background: expected a skin with at least {FEWEST_DOTS} printed dots that lie wholly in view, got {len(dots)}: a "
+                "skin without dots shows no motion that could be told from a change of light"
             )
         distance = torch.cdist(dots, dots)
         self.spacing_px = float(distance.topk(2, largest=False).values[:, 1].median())
         self.knows_camera = camera_mm is not None
         x, y, height = (0.0, 0.0, math.inf) if camera_mm is None else check_camera(camera_mm)
-        self.agrees_px, self.rounds, self.most_px = AGREES * self.spacing_px, ROUNDS, 0.3 * self.diameter_px
+        self.agrees, self.rounds, self.most_px = AGREES, ROUNDS, 0.3 * self.diameter_px
         self.nearest_mm, self.pedestal, self.depth_share, self.depth_mm = NEAREST_CAMERA_MM, PEDESTAL, DEPTH_SHARE, DEPTH_MM
-        self.nugget, self.known, self.least_around = NUGGET, KNOWN, LEAST_AROUND
-        self.bend_share, self.floor_px = BEND_SHARE, FLOOR_PX
+        self.nugget, self.bend_share, self.floor_px = NUGGET, BEND_SHARE, FLOOR_PX
+        middle = 0.5 * dots.new_tensor([self.width - 1.0, self.height - 1.0])
         for name, value in (
+            ("middle_px", middle),
             ("rest_px", dots),
+            ("rest_mm", (dots - middle) * self.mm_per_pixel),
             ("camera", torch.tensor([x, y, 1.0 / height], dtype=torch.float64)),
-            ("around", torch.exp(-0.5 * (distance / (REACH * self.spacing_px)).square())),
-            ("beside", distance < 1.6 * self.spacing_px),
+            ("beside", distance < REACH * self.spacing_px),
         ):
             self.register_buffer(name, value if value.dtype == torch.bool else value.to(background.dtype))
         grey = self.log_light(background[None])
@@ -219,6 +212,7 @@ class SkinMotion(nn.Module):
         check_same_size("images", images, "the calibration", self.height, self.width)
         check_same_size("depth_mm", depth_mm, "images", self.height, self.width)
         check_same_count("depth_mm", depth_mm, "images", images.shape[0])
+        start = self.rest_px[None]
         if last is not None:
             if not torch.jit.is_scripting():
                 check_last(last)
@@ -228,54 +222,47 @@ class SkinMotion(nn.Module):
                     f"last: expected the motion of {self.rest_px.shape[0]} dots, got {last.displacement_mm.shape[1]}: of another "
                     "unit?"
                 )
+            start = self.px_of(last.displacement_mm.detach())
         grey = self.log_light(images)
         coarse, fine = self.coarse.prepare(grey.detach()), self.fine.prepare(grey)
-        place, seen = self.find(coarse, fine.detach(), last)
+        start = start.expand(images.shape[0], -1, -1)
+        place, seen = self.find(coarse, fine.detach(), start, last is not None)
         same = torch.eye(2, dtype=place.dtype, device=place.device)
         place = torch.where(seen[..., None], self.fine.step(fine.detach(), place, self.fine.patch, same), place)
         around, warp, beside = self.surroundings(place, seen)
         for _ in range(2):
             place = torch.where(seen[..., None], self.fine.step(fine.detach(), place, around, warp), place)
-        settled = self.fine.settle(fine, place, around, self.most_px)
-        place = settled.place
+        place, covariance, there = self.fine.settle(fine, place, around, self.most_px)
         if place.requires_grad:  # a dot that moves bends the skin in others
             shares = self.process(place - self.rest_px, seen)[0]
             by_bend = self.by_bend.reshape(-1, 2, 2, place.shape[1])
             bends = torch.einsum("nkjm,bmj->bnk", by_bend, shares - shares.detach())
             place = place - (warp @ bends[..., None])[..., 0]
-        noise = (settled.covariance + self.floor_px**2 * same) * seen[..., None, None].to(place.dtype)
-        return self.in_mm(place, noise + beside, seen & settled.there, depth_mm)
+        noise = (covariance + self.floor_px**2 * same) * seen[..., None, None].to(place.dtype)
+        return self.in_mm(place, noise + beside, seen & there, depth_mm)
 
     def log_light(self, images: Tensor) -> Tensor:
         """(B, 1, H, W): mean of the channels' logarithms, in which light from opposite sides cancels."""
         return torch.log(images.clamp_min(0.0) + self.pedestal).mean(dim=1, keepdim=True)
 
-    def find(self, coarse: Tensor, fine: Tensor, last: DotMotion | None) -> tuple[Tensor, Tensor]:
+    def find(self, coarse: Tensor, fine: Tensor, start: Tensor, known_start: bool) -> tuple[Tensor, Tensor]:
         """Places (B, N, 2) px of dots, and which are seen, (B, N) bool; others are where their neighbours expect them."""
-        count = coarse.shape[0]
-        start = self.rest_px[None].expand(count, -1, -1) if last is None else self.px_of(last.displacement_mm.detach())
-        start = start.expand(count, -1, -1)
         place, seen = self.register(coarse, fine, start)
-        if last is None:
-            seen = self.joined(place, seen)
-        seen = self.consistent(place, start, seen)
-        if last is None:  # without those that what contradicted them joined to others
-            seen = self.joined(place, seen)
-        for _ in range(self.rounds if last is None else 1):
-            expected, variance = self.expected(place, start, seen)
-            wanted = ~seen & (variance < self.known) & self.in_view(expected)
+        seen = self.consistent(place - start, seen, known_start)
+        for _ in range(1 if known_start else self.rounds):
+            _, _, expected, variance, _ = self.process(place - start, seen)
+            expected = start + expected
+            known_px = self.spacing_px * (self.agrees - variance)
+            wanted = ~seen & (known_px > 0.0) & self.in_view(expected)
             if not bool(wanted.any()):
                 break
             tried, there = self.register(coarse, fine, expected)
-            near = (tried - expected).square().sum(-1).sqrt() < self.agrees_px * (1.0 - variance / self.known)  # else next round
-            gained = wanted & there & near
+            gained = wanted & there & ((tried - expected).square().sum(-1).sqrt() < known_px)  # others in the next round
             if not bool(gained.any()):
                 break
             place = torch.where(gained[..., None], tried, place)
-            seen = self.consistent(place, start, seen | gained)
-            if last is None:
-                seen = self.joined(place, seen)
-        return torch.where(seen[..., None], place, self.expected(place, start, seen)[0]), seen
+            seen = self.consistent(place - start, seen | gained, known_start)
+        return torch.where(seen[..., None], place, start + self.process(place - start, seen)[2]), seen
 
     def register(self, coarse: Tensor, fine: Tensor, start: Tensor) -> tuple[Tensor, Tensor]:
         """Places of dots (B, N, 2) px from a start, and whether they are there."""
@@ -288,112 +275,96 @@ class SkinMotion(nn.Module):
         x, y, rim = place[..., 0], place[..., 1], self.rim_px
         return (x > rim) & (y > rim) & (x < float(self.width) - 1.0 - rim) & (y < float(self.height) - 1.0 - rim)
 
-    def process(self, moved: Tensor, seen: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """The Gaussian process through motions (B, N, 2) of seen dots.
+    def process(self, moved: Tensor, seen: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """The Gaussian process through motions (B, N, 2) px of seen dots.
 
         Returns:
-            The shares of dots in its mean, (B, N, 2), its inverse covariance, (B, N, N), in units of its variance, and this
-            variance around each dot, (B, N): that with which others miss the dots there, as large as it should be.
+            The shares of dots in its mean, (B, N, 2), and its inverse covariance, (B, N, N), in units of its variance; the motion
+            of each dot that the others expect, (B, N, 2), and the variance of this, (B, N), in these units; and the units around
+            each dot, (B, N) px^2: with them others miss the dots there by as much as they should.
         Source:
-            Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, eq. 2.25 and 5.12 (leave one out).
+            Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, eq. 2.25, 2.26 and 5.12 (leave one out).
         """
         known = seen.to(moved.dtype)
         system = self.alike * known[:, :, None] * known[:, None] + torch.diag_embed(self.nugget + 1.0 - known)
         inverse = torch.cholesky_inverse(torch.linalg.cholesky(system))
         shares = inverse @ (moved * known[..., None])
-        missed = 0.5 * shares.square().sum(-1) / inverse.diagonal(dim1=1, dim2=2)
-        return shares, inverse, (self.around @ missed[..., None])[..., 0] / (self.around @ known[..., None])[..., 0].clamp_min(1e-3)
-
-    def expected(self, place: Tensor, start: Tensor, seen: Tensor) -> tuple[Tensor, Tensor]:
-        """Places (B, N, 2) px where the motion of other dots from a start expects dots, and the variance (B, N) in units of all."""
-        moved = place - start
-        shares, inverse, _ = self.process(moved, seen)
+        alike = self.alike * known[:, None]
         left_out = 1.0 / inverse.diagonal(dim1=1, dim2=2)
-        alike = self.alike * seen.to(place.dtype)[:, None]
         mean = torch.where(seen[..., None], moved - shares * left_out[..., None], alike @ shares)
-        return start + mean, torch.where(seen, left_out, 1.0 - ((alike @ inverse) * alike).sum(-1))
+        variance = torch.where(seen, left_out, 1.0 - ((alike @ inverse) * alike).sum(-1))
+        missed = 0.5 * shares.square().sum(-1) * left_out
+        around = self.beside.to(moved.dtype)
+        unit = (around @ missed[..., None])[..., 0] / (around @ known[..., None])[..., 0].clamp_min(1.0)
+        return shares, inverse, mean, variance, unit
 
     def surroundings(self, place: Tensor, seen: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Patches (B, N, P, 2) px as the process bends them, their warp (B, N, 2, 2), and a covariance (B, N, 2, 2) px^2.
 
         This is of a seen dot what is not known of its bend, of another what is not known of its place.
         """
-        shares, inverse, variance = self.process(place - self.rest_px, seen)
+        shares, inverse, _, variance, unit = self.process(place - self.rest_px, seen)
         slopes = self.slopes @ shares[:, None]  # (B, N, 5, 2)
         slopes = torch.cat((slopes[..., :2, :].clamp(-0.6, 0.6), slopes[..., 2:, :]), -2)
-        around = self.fine.patch + self.terms @ slopes
-        known = seen.to(place.dtype)
-        bend = (self.by_bend * known[:, None, None]).flatten(1, 2)  # (B, 4 N, N): of both axes by bends along both
+        same = torch.eye(2, dtype=place.dtype, device=place.device)
+        bend = (self.by_bend * seen.to(place.dtype)[:, None, None]).flatten(1, 2)  # (B, 4 N, N): both axes, by bends along both
         half = (bend @ inverse).reshape(len(place), -1, 2, 2, place.shape[1])
         told = half.flatten(3) @ bend.reshape(half.shape).flatten(3).mT
-        unknown = 1.0 - ((self.alike * known[:, None] @ inverse) * self.alike).sum(-1)
-        same = torch.eye(2, dtype=place.dtype, device=place.device)
-        return (
-            around,
-            same + slopes[..., :2, :].mT,
-            variance[..., None, None]
-            * torch.where(seen[..., None, None], self.bend_share**2 * (self.prior - told), unknown[..., None, None] * same),
-        )
+        bends = self.bend_share**2 * (self.prior - told)
+        unknown = torch.where(seen[..., None, None], bends, variance[..., None, None] * same)
+        return self.fine.patch + self.terms @ slopes, same + slopes[..., :2, :].mT, unit[..., None, None] * unknown
 
-    def consistent(self, place: Tensor, start: Tensor, seen: Tensor) -> Tensor:
-        """Seen dots without those that contradict their neighbours or share a place with a better one, the worst first."""
-        miss = torch.zeros_like(place[..., 0])
+    def consistent(self, moved: Tensor, seen: Tensor, known_start: bool) -> Tensor:
+        """Seen dots without those whose motion, (B, N, 2) px, contradicts their neighbours, the worst first.
+
+        Without a frame before, what neighbours do not join to most of the others is left out, too: it may have moved by a spacing.
+        """
         for _ in range(self.rounds):
-            expected, variance = self.expected(place, start, seen)
-            miss = (place - expected).square().sum(-1).sqrt() * (seen & (variance < self.known)).to(place.dtype)
-            worst = (miss > self.agrees_px) & (miss >= (miss[:, None] * self.around.gt(self.least_around)).amax(-1))
+            _, _, mean, variance, _ = self.process(moved, seen)
+            miss = (moved - mean).square().sum(-1).sqrt() * (seen & (variance < self.agrees)).to(moved.dtype)
+            worst = (miss > self.agrees * self.spacing_px) & (miss >= (miss[:, None] * self.beside).amax(-1))
             if not bool(worst.any()):
                 break
             seen = seen & ~worst
-        apart = torch.cdist(place, place) + self.spacing_px * torch.eye(place.shape[1], dtype=place.dtype, device=place.device)
-        other = (apart < self.agrees_px) & seen[:, None] & (miss[:, None] <= miss[:, :, None])
-        return seen & ~other.any(-1)
+        return seen if known_start else self.joined(moved, seen)
 
-    def joined(self, place: Tensor, seen: Tensor) -> Tensor:
-        """Seen dots that neighbours which agree with them join to most of the others."""
-        moved = place - self.rest_px
-        agree = (torch.cdist(moved, moved) < 1.5 * self.agrees_px) & self.beside & seen[:, None] & seen[:, :, None]
-        label = torch.where(seen, torch.arange(1, place.shape[1] + 1, device=place.device), 0)
-        for _ in range(place.shape[1]):
+    def joined(self, moved: Tensor, seen: Tensor) -> Tensor:
+        """Seen dots that neighbours which moved alike, (B, N, 2) px, join to most of the others."""
+        agree = (torch.cdist(moved, moved) < 1.5 * self.agrees * self.spacing_px) & self.beside & seen[:, None] & seen[:, :, None]
+        label = torch.where(seen, torch.arange(1, moved.shape[1] + 1, device=moved.device), 0)
+        for _ in range(moved.shape[1]):
             before = label
             label = torch.maximum(label, torch.where(agree, label[:, None], 0).amax(-1))
             if bool((label == before).all()):
                 break
-        sizes = torch.zeros_like(place[..., 0]).scatter_add(1, (label - 1).clamp_min(0), seen.to(place.dtype))
+        sizes = torch.zeros_like(moved[..., 0]).scatter_add(1, (label - 1).clamp_min(0), seen.to(moved.dtype))
         return seen & (label - 1 == sizes.argmax(dim=1, keepdim=True))
 
     def in_mm(self, place: Tensor, covariance: Tensor, seen: Tensor, depth_mm: Tensor) -> DotMotion:
         """The record of places (B, N, 2) px and their covariance: through the camera, with depth as the third coordinate."""
-        size = torch.tensor([self.width - 1.0, self.height - 1.0], dtype=place.dtype, device=place.device)
-        grid = (2.0 * place / size - 1.0)[:, :, None]
         maps = torch.cat((depth_mm, gradient_of_depth(depth_mm.detach(), self.mm_per_pixel)), dim=1).expand(len(place), -1, -1, -1)
-        at = nn.functional.grid_sample(maps, grid, mode="bilinear", padding_mode="border", align_corners=True)[
-            ..., 0
-        ].mT  # (B, N, 3)
+        grid = (place / self.middle_px - 1.0)[:, :, None]
+        at = nn.functional.grid_sample(maps, grid, "bilinear", "border", align_corners=True)[..., 0].mT  # (B, N, 3)
         depth, slope = at[..., :1], at[..., 1:].detach()
         axis = self.camera[:2]
-        from_axis = (place - 0.5 * size) * self.mm_per_pixel - axis
-        rest = (self.rest_px - 0.5 * size) * self.mm_per_pixel
+        from_axis = (place - self.middle_px) * self.mm_per_pixel - axis
         nearer = 1.0 - depth * self.camera[2]
-        displacement = torch.cat((from_axis * nearer + axis - rest, depth), dim=-1)
-        # derivatives by the place, mm of the image, and by depth
-        by_depth = torch.cat((-from_axis * self.camera[2], torch.ones_like(depth)), dim=-1).detach()
-        nearer = torch.cat((nearer, nearer, torch.zeros_like(depth)), dim=-1).detach()
-        by_place = torch.diag_embed(nearer)[..., :2] + by_depth[..., None] * slope[..., None, :]
-        depth_variance = (self.depth_share * depth.detach()).square() + self.depth_mm**2
-        shared = by_place @ (self.mm_per_pixel**2 * covariance.detach()) @ by_place.mT
-        shared = shared + depth_variance[..., None] * by_depth[..., None] * by_depth[..., None, :]
+        displacement = torch.cat((from_axis * nearer + axis - self.rest_mm, depth), dim=-1)
+        # derivatives by depth, and by the place, mm of the image
+        by_depth = torch.cat((-from_axis * self.camera[2], torch.ones_like(depth)), dim=-1).detach()[..., None]
+        by_place = nearer.detach()[..., None] * torch.eye(3, 2, dtype=place.dtype, device=place.device)
+        by_place = by_place + by_depth * slope[..., None, :]
+        depth_variance = ((self.depth_share * depth.detach()).square() + self.depth_mm**2)[..., None]
+        shared = by_place @ (self.mm_per_pixel**2 * covariance.detach()) @ by_place.mT + depth_variance * by_depth @ by_depth.mT
         unknown = torch.zeros_like(depth) if self.knows_camera else depth.detach() / self.nearest_mm
         pinhole = (from_axis.detach().square().sum(-1, keepdim=True).sqrt() * unknown)[..., 0]
-        return DotMotion(rest, displacement, shared, seen, pinhole, self.height, self.width, self.mm_per_pixel)
+        return DotMotion(self.rest_mm, displacement, shared, seen, pinhole, self.height, self.width, self.mm_per_pixel)
 
     def px_of(self, displacement_mm: Tensor) -> Tensor:
         """Places (B, N, 2) px that see displaced dots (B, N, 3)."""
-        size = torch.tensor([self.width - 1.0, self.height - 1.0], dtype=displacement_mm.dtype, device=displacement_mm.device)
-        rest = (self.rest_px - 0.5 * size) * self.mm_per_pixel
         axis = self.camera[:2]
-        seen = (rest + displacement_mm[..., :2] - axis) / (1.0 - displacement_mm[..., 2:] * self.camera[2]) + axis
-        return seen / self.mm_per_pixel + 0.5 * size
+        seen = (self.rest_mm + displacement_mm[..., :2] - axis) / (1.0 - displacement_mm[..., 2:] * self.camera[2]) + axis
+        return seen / self.mm_per_pixel + self.middle_px
 
 
 @lru_cache(maxsize=1)  # finding the dots takes longer than following them

@@ -11,9 +11,10 @@ from typing import Any, Protocol
 import numpy as np
 from torch import Tensor
 
-from ..core.checks import check_choice, check_positive
+from ..core.checks import check_choice, check_integer, check_positive, check_record
 from ..core.geometry import depth_to_points
 from ..model import Sensor
+from ..skin import DotMotion, SkinMotion
 from .live import TactileFrame
 
 __all__ = [
@@ -25,6 +26,7 @@ __all__ = [
     "PointField",
     "cloud_message",
     "depth_message",
+    "dots_message",
     "header",
     "image_message",
     "lerobot_features",
@@ -39,6 +41,9 @@ FLOAT32 = 7
 
 POINT_FIELDS = ("x", "y", "z", "normal_x", "normal_y", "normal_z")
 """Values of a point of :func:`cloud_message`, each a little-endian float32."""
+
+DOT_FIELDS = ("x", "y", "z", "dx", "dy", "dz")
+"""Values of a point of :func:`dots_message`, likewise."""
 
 STATE_NAMES = ("contact_area_mm2", "largest_depth_mm")
 """What :func:`lerobot_frame` states of a frame beside its images."""
@@ -97,18 +102,18 @@ class PointField:
 
 @dataclass(frozen=True)
 class CloudMessage:
-    """The fields of ``sensor_msgs/PointCloud2``, of an unordered cloud.
+    """The fields of ``sensor_msgs/PointCloud2``, of a cloud in one row.
 
     Attributes:
         header: stamp and frame.
         height: 1.
         width: number of points; 0 without contact.
-        fields: of a point, in the order of :data:`POINT_FIELDS`.
+        fields: of a point, in the order of :data:`POINT_FIELDS` or :data:`DOT_FIELDS`.
         is_bigendian: False.
         point_step: bytes of a point.
         row_step: bytes of all points.
         data: row_step bytes.
-        is_dense: True: no point is invalid.
+        is_dense: whether no point is NaN.
     """
 
     header: Header
@@ -168,22 +173,39 @@ def cloud_message(frame: TactileFrame, mm_per_pixel: float, frame_id: str = "tac
     out = frame.output
     points_m = 1e-3 * _numpy(depth_to_points(out.depth_mm, check_positive("mm_per_pixel", mm_per_pixel), out.contact))
     normals = _numpy(out.normal[0].movedim(0, -1)[out.contact[0, 0]]) * np.array([1.0, -1.0, 1.0])  # image y down, point y up
-    values = np.concatenate((points_m, normals), axis=1).astype("<f4")
-    fields = tuple(PointField(name, 4 * index, FLOAT32, 1) for index, name in enumerate(POINT_FIELDS))
-    step = 4 * len(POINT_FIELDS)
-    stamp = header(frame, frame_id, start_s)
-    return CloudMessage(stamp, 1, len(values), fields, False, step, step * len(values), values.tobytes(), True)
+    return _cloud(header(frame, frame_id, start_s), POINT_FIELDS, np.concatenate((points_m, normals), axis=1))
 
 
-def lerobot_features(sensor: Sensor, name: str = "tactile", image_dtype: str = "video") -> dict[str, dict[str, Any]]:
+def dots_message(frame: TactileFrame, moved: DotMotion, frame_id: str = "tactile", start_s: float = 0.0) -> CloudMessage:
+    """Printed dots as points: where each is, and how far it has moved from rest, in the axes of :func:`cloud_message`, metres.
+
+    Point k is dot k in all frames; a dot that is not seen is NaN. ``moved`` is what :class:`torchvts.SkinMotion` gives for the
+    frame; the other arguments are those of :func:`header`.
+    """
+    check_record("moved", moved, DotMotion)
+    displacement, rest = _numpy(moved.displacement_mm)[0], np.pad(_numpy(moved.rest_mm), ((0, 0), (0, 1)))
+    values = 1e-3 * np.concatenate((rest + displacement, displacement), axis=1) * np.tile([1.0, -1.0, 1.0], 2)
+    values[~_numpy(moved.seen)[0]] = np.nan
+    return _cloud(header(frame, frame_id, start_s), DOT_FIELDS, values)
+
+
+def _cloud(stamp: Header, names: tuple[str, ...], values: Array) -> CloudMessage:
+    fields, step = tuple(PointField(name, 4 * index, FLOAT32, 1) for index, name in enumerate(names)), 4 * len(names)
+    dense, data = not bool(np.isnan(values).any()), values.astype("<f4").tobytes()
+    return CloudMessage(stamp, 1, len(values), fields, False, step, len(data), data, dense)
+
+
+def lerobot_features(sensor: Sensor, name: str = "tactile", image_dtype: str = "video", dots: int = 0) -> dict[str, dict[str, Any]]:
     """The features of a LeRobot data set that hold a tactile stream, for ``LeRobotDataset.create(..., features=...)``.
 
     Args:
         sensor: gives the size of the frames.
         name: of the sensor, as in "observation.images.<name>".
         image_dtype: "video" or "image": how the data set stores images and depth. Videos need :data:`LEROBOT_DEPTH`.
+        dots: printed dots whose motion is stored too, ``len(motion.rest_px)`` of a :class:`torchvts.SkinMotion`; 0 for none.
     Returns:
-        Dtype, shape and names of the axes of the camera's image, of depth, whose unit is in its info, and of :data:`STATE_NAMES`.
+        Dtype, shape and names of the axes of the camera's image, of depth, whose unit is in its info, of :data:`STATE_NAMES`, and
+        of the dots.
     Example:
         >>> lerobot_features(Sensor("rig", 240, 320, 0.06))["observation.images.tactile_depth"]["info"]
         {'is_depth_map': True, 'depth_unit': 'm'}
@@ -191,29 +213,42 @@ def lerobot_features(sensor: Sensor, name: str = "tactile", image_dtype: str = "
     check_choice("image_dtype", image_dtype, ("video", "image"))
     height, width = sensor.height, sensor.width
     axes, depth = ["height", "width", "channels"], {"is_depth_map": True, "depth_unit": "m"}
-    return {
+    number = check_integer("dots", dots, 0)
+    moved = {"dtype": "float32", "shape": (number, 4), "names": ["dots", "x_y_depth_mm_seen"]}
+    features: dict[str, dict[str, Any]] = {
         f"observation.images.{name}": {"dtype": image_dtype, "shape": (height, width, 3), "names": axes},
         f"observation.images.{name}_depth": {"dtype": image_dtype, "shape": (height, width, 1), "names": axes, "info": depth},
         f"observation.{name}.state": {"dtype": "float32", "shape": (len(STATE_NAMES),), "names": list(STATE_NAMES)},
     }
+    return features | {f"observation.{name}.dots": moved} if number else features
 
 
-def lerobot_frame(frame: TactileFrame, mm_per_pixel: float, name: str = "tactile") -> dict[str, Array]:
+def lerobot_frame(
+    frame: TactileFrame, mm_per_pixel: float, name: str = "tactile", moved: DotMotion | None = None
+) -> dict[str, Array]:
     """A frame as the arrays that :func:`lerobot_features` describes.
 
     Args:
         frame: of a :class:`TactileStream`.
         mm_per_pixel: pitch, mm.
         name: of the sensor, as in the features.
+        moved: of the printed dots, what :class:`torchvts.SkinMotion` gives for the frame; None for none.
     Returns:
-        uint8 (H, W, 3), float32 (H, W, 1), depth in metres, and float32 (2,).
+        uint8 (H, W, 3), float32 (H, W, 1), depth in metres, and float32 (2,); with ``moved`` float32 (N, 4): displacement along x,
+        along y and depth, mm, and 1 where the dot is seen. One that is not seen has what its neighbours expect.
     """
+    dots = {}
+    if moved is not None:
+        check_record("moved", moved, DotMotion)
+        values = np.concatenate((_numpy(moved.displacement_mm)[0], _numpy(moved.seen)[0, :, None]), axis=1)
+        dots = {f"observation.{name}.dots": values.astype(np.float32)}
     depth_mm = _numpy(frame.output.depth_mm)[0, 0].astype(np.float32)
     area_mm2 = float(frame.output.contact.sum()) * check_positive("mm_per_pixel", mm_per_pixel) ** 2
     return {
         f"observation.images.{name}": _rgb8(frame.image),
         f"observation.images.{name}_depth": (1e-3 * depth_mm)[..., None],
         f"observation.{name}.state": np.array([area_mm2, depth_mm.max()], dtype=np.float32),
+        **dots,
     }
 
 
@@ -233,6 +268,7 @@ def record_episode(
     dataset: EpisodeDataset,
     task: str,
     name: str = "tactile",
+    motion: SkinMotion | None = None,
 ) -> int:
     """Write a stream as one episode of a LeRobot data set.
 
@@ -242,14 +278,17 @@ def record_episode(
         dataset: made with the features of :func:`lerobot_features`.
         task: what is done in the episode, in words.
         name: of the sensor, as in the features.
+        motion: follows the printed dots from frame to frame; then the features need their number. None for none.
     Returns:
         The number of frames; without any the episode is not saved. Where the source stops with an error, or Ctrl-C ends it, the
         frames until then are saved, and the error is raised.
     """
-    count = 0
+    count, moved = 0, None
     try:
         for frame in frames:
-            dataset.add_frame({**lerobot_frame(frame, mm_per_pixel, name), "task": task})
+            if motion is not None:
+                moved = motion(frame.image.reshape(1, *frame.image.shape[-3:]), frame.output.depth_mm, moved)
+            dataset.add_frame({**lerobot_frame(frame, mm_per_pixel, name, moved), "task": task})
             count += 1
     finally:
         if count > 0:

@@ -457,7 +457,7 @@ REASONS = {
     "twice the diameter": "but 12 mm was given: a wrong diameter, or skin that answers otherwise",
     "half the diameter": "3 mm",
     "a diameter in metres": "is its diameter in mm?",
-    "an absurd diameter": "not a clean press, or a wrong diameter",
+    "an absurd diameter": "but 500 mm was given: a wrong diameter",
     "saturated": r"\d+% of the contact is saturated: lower the exposure",
     "two balls": "2 contacts in one image: press one ball at a time",
     "another scene": "another unit, other exposure, or the light has changed",

@@ -70,7 +70,9 @@ def test_presses_are_kept_or_refused_until_the_error_that_was_asked_for_is_state
     assert "still and untouched: the background is taken" in said
     assert "press the ball of 5 mm and hold it still: anywhere, 0.3 to 0.8 mm deep" in said
     assert any(line.startswith("press 1: kept: a circle at x 79, y 60 px") for line in said)
-    assert any(line.startswith("press 2: refused: its slopes are") for line in said)
+    assert any(line.startswith("press 2: kept (counts 0.") and "those of a ball of any size" in line for line in said)
+    assert any(line.startswith("by 2 presses: depth is NOT METRIC") for line in said)  # which of two is wrong, the third shows
+    assert any(line.startswith("press 2: refused: counts 0.0") for line in said)
     assert any(line.startswith("press 3: kept: a circle at x 45, y 43 px") for line in said)
     assert sum(line.startswith("press the ball of 5 mm and hold it still: around x ") for line in said) == 2
     assert not any(line.startswith(("press 4", "ended before")) for line in said)  # the film goes on
@@ -122,7 +124,7 @@ def test_a_place_in_raw_frames_is_kept_in_raw_ones(unit, shots, tmp_path):
     assert watch.touched(session.background) and watch.moves()
     session.add(watch.picture(), BALL_MM)
     assert [press.name for press in session.presses] == ["1"] and session.presses[0].image.shape == (3, 120, 160)
-    session.leave_out_last()
+    session.leave_out("1")
     assert session.presses == [] and not (session.folder / "catalog.csv").exists()
 
 

@@ -14,12 +14,16 @@ from ..core.checks import in_one_line
 from ..core.files import Pixels, check_folder, image_to_bytes, make_folder, rgb_from_bgr, write_atomically
 from ..model import Calibration, Sensor
 from ..model.gs_sdk import CATALOG_COLUMNS
+from ..model.report import PressRow
 from ..model.summary import NOT_METRIC, where_next
 from ..stream import FIRST_FRAMES, Unreadable, find_background
 from ..stream.background import check_steady, is_touched
 from ..stream.numbered import NumberedFrame
 from ..viz import calibration_figure, save_figure
 from .options import calibrated, read_folder
+
+LEAST_WEIGHT = 1 / 16
+"""A press that counts less, by what the others expect of it, is refused."""
 
 LONG = 300
 """Frames after which a press that is not lifted is perhaps none."""
@@ -65,9 +69,9 @@ class Session:
         _write_png(make_folder(self.folder / name) / "gelsight.png", image)
         self._write_catalog([*self._rows(), (name, f"{ball_diameter_mm:g}")])
 
-    def leave_out_last(self) -> None:
-        """Take the last press out of the catalog."""
-        self._write_catalog(self._rows()[:-1])
+    def leave_out(self, name: str) -> None:
+        """Take a press out of the catalog."""
+        self._write_catalog([row for row in self._rows() if row[0] != name])
 
     def _rows(self) -> list[tuple[str, str]]:
         return [(press.name, f"{press.ball_diameter_mm:g}") for press in self.presses]
@@ -162,7 +166,7 @@ class Guide:
             f"{session.folder} keeps the background and each press, {picture} shows them; Ctrl-C ends, the same command goes on"
         )
         if session.presses:  # the last one was perhaps not judged yet
-            self._judge_last()
+            self._judge()
 
     @property
     def reached(self) -> bool:
@@ -193,7 +197,7 @@ class Guide:
         elif not self.watch.moves():
             self._lifted, self._held = False, 0
             self.session.add(self.watch.picture(), self.ball_diameter_mm)
-            self._judge_last()
+            self._judge()
         return not self.reached
 
     def _rest(self) -> None:
@@ -204,33 +208,41 @@ class Guide:
         self.session.set_background(self.watch.picture())
         self._say("still and untouched: the background is taken")
 
-    def _judge_last(self) -> None:
-        """Calibrate by all presses of the session: the last one is kept, or refused with its reason."""
+    def _judge(self) -> None:
+        """Calibrate by all presses of the session: the last one is kept, or refused with its reason, as may be those before it."""
         session = self.session
         assert session.background is not None
         last = session.presses[-1].name
-        try:
-            unit = calibrated(session.background, session.sensor, session.presses, self.force)
-        except ValueError as error:
-            session.leave_out_last()
-            self._say(f"press {last}: refused: {in_one_line(error)}")
-            return
+        refused: list[PressRow] | None = None
+        while refused is None or refused:
+            if not session.presses:
+                return
+            try:
+                unit = calibrated(session.background, session.sensor, session.presses, self.force)
+            except ValueError as error:
+                self._refuse(last, in_one_line(error))
+                return
+            rows = {row["name"]: row for row in unit.report["presses"]}
+            refused = [row for row in rows.values() if row["weight"] < LEAST_WEIGHT]
+            for row in refused:
+                self._refuse(row["name"], row.get("reason", ""))
         make_folder(self.picture.parent)
         save_figure(calibration_figure(unit, session.presses), self.picture)
-        row = next(row for row in unit.report["presses"] if row["name"] == last)
-        if not row["used"]:
-            session.leave_out_last()
-            self._say(f"press {last}: refused: {row.get('reason', '')}")
-            return
         self.unit = unit
-        (x, y), radius = row["center_px"], row["contact_radius_px"]
-        circle = f"a circle at x {x:.0f}, y {y:.0f} px, radius {radius:.0f} px"
-        doubt = f" ({row['reason']})" if row.get("reason") else ""
-        self._say(f"press {last}: kept{doubt}: {circle}")
+        if last in rows:
+            row = rows[last]
+            (x, y), radius = row["center_px"], row["contact_radius_px"]
+            circle = f"a circle at x {x:.0f}, y {y:.0f} px, radius {radius:.0f} px"
+            doubt = f" ({row['reason']})" if row.get("reason") else ""
+            self._say(f"press {last}: kept{doubt}: {circle}")
         stated = f"normals are expected to about {unit.report['stated_deg']:.1f} degrees"
         count = len(session.presses)
         so_far = stated if unit.metric else f"{NOT_METRIC}: {unit.report['not_metric'][0]}"
         self._say(f"by {count} press{'es' if count > 1 else ''}: {so_far}; {self.until_deg:g} are asked for")
+
+    def _refuse(self, name: str, reason: str) -> None:
+        self.session.leave_out(name)
+        self._say(f"press {name}: refused: {reason}")
 
     def _say(self, text: str) -> None:
         """Print a sentence, once until there is another."""

@@ -9,7 +9,8 @@ from ..model.calibration import Calibration
 from ..model.report import Report
 from ..model.response_field import SensorPrior
 from ..model.sensor import Sensor
-from .contacts import Contact, press_row, read_contacts
+from .contacts import Contact, press_row, read_contacts, used
+from .posterior import weights_of
 from .presses import Press
 from .response_fit import FEW, fit_response
 
@@ -37,11 +38,14 @@ def by_presses(
     contacts = read_contacts(presses, background, chosen)
     fit = fit_response(contacts, chosen, prior, progress)
     count = sum(not contact.reason for contact in contacts)
+    weight, given = float(weights_of(used(contacts)).sum()), f"{count} press{'es' * (count > 1)}"
+    if f"{weight:.1f}" != f"{count:.1f}":
+        given += f" that count as {weight:.1f}"
     error = f"{fit.held_out_deg:.2f} degrees on each by the others" if count >= FEW else f"{fit.stated_deg:.1f} degrees expected"
     report: Report = {
         "model": "response",
         "source": "presses",
-        "reason": f"from {'the sensor' + chr(39) + 's prior and ' if prior else ''}{count} press{'es' * (count > 1)}: {error}",
+        "reason": f"from {'the sensor' + chr(39) + 's prior and ' if prior else ''}{given}: {error}",
         "held_out_deg": fit.held_out_deg,
         "own_deg": fit.own_deg,
         "stated_deg": fit.stated_deg,

@@ -267,7 +267,7 @@ class Confidence(nn.Module):
         error = light_std_by_fit(calibration) if calibration.response is None else StatedError.from_calibration(calibration)
         options: dict[str, Any] = {"measured": calibration.measured, "blur_px": sensor.blur_px}
         if calibration.response is not None:
-            used = sum(row["used"] for row in calibration.report.get("presses", []))
+            used = sum(row.get("weight", 1.0) for row in calibration.report.get("presses", []))
             options["presses"] = used + (OF_TYPE if "prior_deg" in calibration.report else OF_SENSORS)
         options["pattern"] = float((calibration.background + PEDESTAL).log().flatten(1).std(dim=1).square().mean().sqrt())
         return cls(block, noise, calibration.noise_std, error, sensor.mm_per_pixel, **options)

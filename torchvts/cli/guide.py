@@ -160,7 +160,7 @@ class Guide:
         self.session, self.watch, self.ball_diameter_mm = session, watch, ball_diameter_mm
         self.until_deg, self.picture, self.force = until_deg, picture, force
         self.unit: Calibration | None = None
-        self._said = ""
+        self._said, self._where = "", "anywhere, 0.3 to 0.8 mm deep"
         self._lifted, self._held = False, 0
         self._say(
             f"{session.folder} keeps the background and each press, {picture} shows them; Ctrl-C ends, the same command goes on"
@@ -185,8 +185,7 @@ class Guide:
             self._rest()
         elif not self.watch.touched(background):
             self._lifted = True
-            where = (self.unit and where_next(self.unit)) or "anywhere, 0.3 to 0.8 mm deep"
-            self._say(f"press the ball of {self.ball_diameter_mm:g} mm and hold it still: {where}")
+            self._say(f"press the ball of {self.ball_diameter_mm:g} mm and hold it still: {self._where}")
         elif not self._lifted:
             self._held += 1
             self._say(
@@ -228,7 +227,7 @@ class Guide:
                 self._refuse(row["name"], row.get("reason", ""))
         make_folder(self.picture.parent)
         save_figure(calibration_figure(unit, session.presses), self.picture)
-        self.unit = unit
+        self.unit, self._where = unit, where_next(unit) or self._where
         if last in rows:
             row = rows[last]
             (x, y), radius = row["center_px"], row["contact_radius_px"]

@@ -59,7 +59,8 @@ def load_unit(arguments: argparse.Namespace) -> tuple[Sensor | Calibration, str]
     """The sensor or the calibration that was given, and the source; sets the threads that were asked for."""
     unit, sources = split_files(arguments)
     if len(sources) > 1:
-        raise UsageError(f"expected one source, got {', '.join(sources)}")
+        remedy = "a folder holds several images, and torchvts pose compares two"
+        raise UsageError(f"expected one source, got {', '.join(sources)}: {remedy}")
     check_integer("--threads", arguments.threads, 1)
     torch.set_num_threads(arguments.threads)
     cv2.setNumThreads(arguments.threads)

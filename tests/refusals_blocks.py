@@ -9,7 +9,7 @@ from refusals_values import *
 import torchvts as vts
 import torchvts.integration
 from torchvts.core.geometry import normal_from_gradient
-from torchvts.integration import DiscontinuityIntegration, PerspectiveIntegration
+from torchvts.integration import PerspectiveIntegration
 from torchvts.model import FillMarkers
 from torchvts.model.response_field import ResponseModel
 from torchvts.pipeline import Confidence
@@ -163,15 +163,7 @@ TABLE = {
         "albedo": [[900.0] * 2, [0.0] * 3, [NAN] * 3, None, "bright"], "gloss": [[0.1] * 2, [-0.1] * 3, [NAN] * 3, "satin"]}),
     "PointLights.forward": Entry({"depth_mm": DEPTH, "normal": torch.zeros(1, 3, HEIGHT, WIDTH), "mm_per_pixel": 1.0},
         {"depth_mm": batches(1), "normal": [*batches(3), torch.zeros(1, 3, 8, 8)], "camera_height_mm": HEIGHTS}, lights),
-    **{name: Entry({"mm_per_pixel": 1.0}, {}) for name in ("PoissonDCT", "PoissonDST", "PoissonBackground")},
-    "AdaptiveIntegration": Entry({"mm_per_pixel": 1.0, "share": 0.1}, {"share": [*NUMBER, 2.0]}),
-    "DiscontinuityIntegration": Entry({"mm_per_pixel": 1.0, "slope_std": 0.05}, {
-        **dict.fromkeys(("mm_per_pixel", "slope_std", "threshold", "residual", "tolerance_px"), NUMBER),
-        "rim_weight": [*NUMBER, 2.0], "max_passes": INTEGER, "max_iterations": INTEGER}),
-    "DiscontinuityIntegration.solve": Entry(
-        {"gradient": GRADIENT, "contact": GRADIENT[:, :1] > 0, "weight": torch.ones(1, 1, 8, 8), **KNOWN},
-        {"contact": BAD_MASKS, "weight": BAD_WEIGHTS, **BAD_KNOWN}, lambda: DiscontinuityIntegration().solve,
-        named={"known_mm": "known_mm", "known_weight": "known_weight|known_mm, known_weight"}),
+    **{name: Entry({"mm_per_pixel": 1.0}, {}) for name in ("AdaptiveIntegration", "PoissonDCT", "PoissonDST", "PoissonBackground")},
     "PerspectiveIntegration": Entry({"mm_per_pixel": 1.0, "camera_height_mm": 30.0, "integrate": vts.PoissonBackground()},
         {"camera_height_mm": NUMBER, "integrate": ["dct", 3]}),
     "PerspectiveIntegration.forward": Entry({"gradient": GRADIENT, **KNOWN}, BAD_KNOWN, lambda: PerspectiveIntegration(1.0, 30.0)),
@@ -202,8 +194,7 @@ TABLE = {
     "PoissonDST.forward": Entry({"gradient": GRADIENT}, {"gradient": batches(2)}, lambda: vts.PoissonDST()),
     **{f"{name}.forward": Entry({"gradient": GRADIENT, **KNOWN}, BAD_KNOWN, lambda name=name: integrator(name)())
         for name in ("PoissonBackground", "PoissonDCT")},
-    **{f"{name}.forward": Entry({"gradient": GRADIENT}, {}, lambda name=name: integrator(name)())
-        for name in ("AdaptiveIntegration", "DiscontinuityIntegration")},
+    "AdaptiveIntegration.forward": Entry({"gradient": GRADIENT}, {}, lambda: vts.AdaptiveIntegration()),
     "Press": Entry(
         {"image": image(), "ball_diameter_mm": 6.0, "center_px": (4.0, 5.0), "contact_radius_px": 3.0},
         {"ball_diameter_mm": NUMBER, "center_px": [(1.0,), "here", (NAN, 0.0)], "contact_radius_px": ["3", 0, -1.0, NAN]},
@@ -279,9 +270,6 @@ TABLE = {
         {"depth_mm": DEPTH, "normal": torch.zeros(1, 3, HEIGHT, WIDTH), "lights": lights(), "mm_per_pixel": 1.0}, {
         "depth_mm": batches(1), "normal": [*batches(3), torch.zeros(1, 3, 8, 8)], "lights": [POSITION, None],
         "camera_height_mm": HEIGHTS}),
-    "integrate_discontinuities": Entry(
-        {"gradient": GRADIENT, "mm_per_pixel": 1.0, "contact": GRADIENT[:, :1] > 0, "weight": torch.ones(1, 1, 8, 8), **KNOWN},
-        {"contact": BAD_MASKS, "weight": BAD_WEIGHTS, **BAD_KNOWN}),
     "integrate_perspective": Entry(
         {"gradient": GRADIENT, "mm_per_pixel": 1.0, "camera_height_mm": 30.0}, {"camera_height_mm": NUMBER}),
     "normal_from_gradient": forward(lambda: normal_from_gradient, 2, "gradient"),

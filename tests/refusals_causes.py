@@ -67,7 +67,6 @@ CAUSES = [
     ("near_field_shading", "normal", torch.zeros(1, 3, 8, 9), f"expected {HEIGHT} x {WIDTH} like depth_mm, got 8 x 9"),
     ("poisson_dst", "gradient", torch.zeros(1, 2, 2, 5), "expected H and W of at least 3, got 2 x 5"),
     ("poisson_dct", "gradient", torch.zeros(1, 2, 1, 5), "expected H and W of at least 2, got 1 x 5"),
-    ("integrate_discontinuities", "weight", 2 * torch.ones(1, 1, 8, 8), "expected values from 0 to 1, got 2 to 2"),
     ("find_markers", "image", torch.zeros(1, 3, 4, 32), "expected more than 5 .* got 4 x 32"),
     ("scenes.sphere_press", "press_mm", 99.0, r"expected a number in \(0, 10\], got 99"),
     ("scenes.letters_press", "text", "abc", "expected capital letters A-Z and spaces, got "),

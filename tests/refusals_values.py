@@ -143,7 +143,6 @@ UP = torch.tensor([0.0, 0.0, 1.0]).reshape(1, 3, 1, 1).expand(1, 3, HEIGHT, WIDT
 OUT = vts.DepthOutput(DEPTH, torch.zeros(1, 2, HEIGHT, WIDTH), UP, DEPTH > 0, DEPTH > 0)
 GRADIENT = torch.zeros(1, 2, 8, 8)
 BAD_GRADIENT = [*batches(2), torch.zeros(1, 2, 1, 8)]
-BAD_MASKS = [torch.zeros(1, 1, 4, 4) > 0, torch.zeros(1, 1, 8, 8), torch.zeros(8, 8) > 0, "all", np.zeros((1, 1, 8, 8), bool)]
 BAD_WEIGHTS = [torch.ones(1, 1, 4, 4), torch.ones(8, 8), torch.ones(1, 1, 8, 8).bool(), "all", np.ones((1, 1, 8, 8))]
 KNOWN = {name: torch.ones(1, 1, 8, 8) for name in ("known_mm", "known_weight")}
 BAD_KNOWN = {

@@ -11,7 +11,7 @@ from torch import nn
 
 import torchvts as vts
 from torchvts.core.geometry import normal_from_gradient
-from torchvts.integration import DiscontinuityIntegration, PerspectiveIntegration
+from torchvts.integration import PerspectiveIntegration
 from torchvts.model import FillMarkers
 
 HEIGHT, WIDTH, PITCH = 48, 64, 0.6
@@ -140,7 +140,6 @@ CASES = {
     "PoissonDCT": (lambda dtype: vts.PoissonDCT(PITCH), gradient, "gradient"),
     "PoissonBackground": (lambda dtype: vts.PoissonBackground(PITCH), gradient, "gradient"),
     "PerspectiveIntegration": (lambda dtype: PerspectiveIntegration(PITCH, 400.0), gradient, "gradient"),
-    "DiscontinuityIntegration": (lambda dtype: DiscontinuityIntegration(PITCH), gradient, "gradient"),
     "AdaptiveIntegration": (lambda dtype: vts.AdaptiveIntegration(PITCH), gradient, "gradient"),
     "ZeroBackground": (lambda dtype: Beside(vts.skin.ZeroBackground(PITCH), dtype), depth, "depth_mm"),
     "SkinMotion": (skin_motion, dotted, "images"),
@@ -152,7 +151,7 @@ CASES = {
 }
 FREE = ("gradient", "normal", "depth_mm")
 SIZED = [name for name, (_, _, argument) in CASES.items() if argument not in FREE and name not in ("FillMarkers", "Rectify")]
-IN_PYTHON = ("DiscontinuityIntegration", "AdaptiveIntegration")
+IN_PYTHON = ("AdaptiveIntegration",)
 """Blocks whose solver is Python code, which no script holds."""
 SCRIPTED = [name for name in CASES if name not in IN_PYTHON]
 every_block = pytest.mark.parametrize("name", CASES)

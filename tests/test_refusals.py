@@ -35,7 +35,7 @@ MODULES = {
 }
 RECORDS = {
     "Calibration", "CalibrationWarning", "Conditions", "ConfidentOutput", "DepthOutput", "Diagnosis", "Diagnosis.of",
-    "DiscontinuitySolution", "Finding", "LightFit", "MlpFit", "Registration", "Result", "export.ExportCheck", "export.Format",
+    "Finding", "LightFit", "MlpFit", "Registration", "Result", "export.ExportCheck", "export.Format",
     "gs_sdk.GsSdkFolder", "gs_sdk.GsSdkPress", "DotMotion", "Slip", "objects.Target", "scenes.Scene",
     "stream.Reader", "stream.TactileFrame", "stream.Unreadable",
 }  # fmt: skip
@@ -45,7 +45,7 @@ PARTS = {
     "DepthBrightness", "Integrator", "NormalModel", "Refine", "ResponseField", "ResponseModel",
     "SensorPrior", "Shadows", "SlopesOfDepth", "SlopesOfPixels", "Solve", "WrappedIntegrator", "WrappedNormals", "as_integrator",
     "as_normal_model", "by_presses", "channel_structure", "check_calibration", "check_domain", "check_sensor",
-    "OutputFrame.", "discontinuity_share", "doubts_of", "label_contacts", "light_levels", "light_unevenness",
+    "OutputFrame.", "doubts_of", "light_levels", "light_unevenness",
     "DotMotion.", "scenes.DottedSkin.", "scenes.Drag.", "motion_of_unit", "moved", "read_point_cloud", "stream.FrameCheck.",
     "stream.NewestFrame", "stream.Overlay", "stream.Recorder.", "stream.Recording.", "stream.StageClock",
     "stream.CameraSettings", "stream.Camera", "stream.Keys", "stream.LiveView", "stream.Sheet", "stream.StreamReport.",

@@ -11,13 +11,8 @@ import torch
 import torchvts as vts
 from lab import metrics
 from torchvts import scenes
-from torchvts.integration import (
-    DiscontinuityIntegration,
-    PerspectiveIntegration,
-    discontinuity_share,
-    integrate_discontinuities,
-    integrate_perspective,
-)
+from torchvts.integration import PerspectiveIntegration, discontinuities, integrate_perspective
+from torchvts.integration.discontinuities import across_walls, discontinuity_share
 from torchvts.normals import NormalFromIntensity
 
 SIZE, PITCH = (120, 160), 0.25
@@ -74,6 +69,11 @@ def noisy(scene, std=0.02, seed=0):
     return scene.gradient + std * noise * scene.contact
 
 
+def integrate(gradient):
+    """With walls in every frame."""
+    return PITCH * across_walls(gradient)
+
+
 def largest_px(depth, scene):
     return metrics.depth_error(depth, scene.depth_mm, PITCH).max_px
 
@@ -83,7 +83,7 @@ def largest_px(depth, scene):
 def test_a_cliff_costs_at_most_a_tenth_of_poissons_error(name, std):
     scene = cliff(name)
     gradient = noisy(scene, std)
-    assert largest_px(integrate_discontinuities(gradient, PITCH), scene) < 0.1 * largest_px(
+    assert largest_px(vts.AdaptiveIntegration(PITCH)(gradient), scene) < 0.1 * largest_px(
         vts.poisson_background(gradient, PITCH), scene
     )
 
@@ -93,7 +93,7 @@ def test_a_cliff_costs_at_most_a_tenth_of_poissons_error(name, std):
 def test_smooth_presses_lose_nothing(name, std):
     scene = SMOOTH[name]()
     gradient = noisy(scene, std)
-    smooth, robust = (solve(gradient, PITCH) for solve in (vts.poisson_background, integrate_discontinuities))
+    smooth, robust = vts.poisson_background(gradient, PITCH), integrate(gradient)
     errors = [metrics.depth_error(depth, scene.depth_mm, PITCH) for depth in (smooth, robust)]
     assert errors[1].rms_px < 1.15 * errors[0].rms_px
     assert errors[1].max_px < 1.25 * errors[0].max_px
@@ -106,17 +106,18 @@ def test_a_wedge_from_an_image_of_eight_bits(noise_std, ring):
     calibration = vts.Calibration.from_lights(ring(), vts.Sensor("rig", *SIZE, PITCH), rest)
     image = scenes.render(scene, ring(), noise_std=noise_std, bits=8)
     error = {}
-    for integrate in (None, DiscontinuityIntegration(PITCH), vts.AdaptiveIntegration(PITCH)):
-        pipe = vts.DepthPipeline.from_calibration(calibration, "precise", integrate=integrate)
-        error[type(integrate)] = largest_px(pipe(image).depth_mm, scene)
-    assert error[DiscontinuityIntegration] < error[type(None)] / 3
+    for block in (None, vts.AdaptiveIntegration(PITCH)):
+        pipe = vts.DepthPipeline.from_calibration(calibration, "precise", integrate=block)
+        error[type(block)] = largest_px(pipe(image).depth_mm, scene)
     assert error[vts.AdaptiveIntegration] < error[type(None)] / 3
 
 
-def test_it_equals_dense_weighted_least_squares_at_its_own_weights():
+def test_it_equals_dense_weighted_least_squares_at_its_own_weights(monkeypatch):
+    for name, value in (("PASSES", 100), ("SETTLED_PX", 1e-7), ("RESIDUAL", 1e-9)):
+        monkeypatch.setattr(discontinuities, name, value)
     scene = scenes.surface(prism(lambda t: 2.0 - t.abs(), 5.0, 0.0), 15, 18, 0.5, torch.float64)
     gradient = noisy(scene)
-    depth = DiscontinuityIntegration(0.5, max_passes=100, tolerance_px=1e-7, residual=1e-9).solve(gradient).depth_mm
+    depth = 0.5 * across_walls(gradient)
     twin = references.cliffs(gradient[0].numpy(), scene.contact[0, 0].numpy(), 0.5, 0.05, 2.0, 0.1, depth[0, 0].numpy())
     assert np.abs(depth[0, 0].numpy() - twin).max() < 1e-6
 
@@ -124,61 +125,38 @@ def test_it_equals_dense_weighted_least_squares_at_its_own_weights():
 @every_cliff
 def test_depth_is_zero_on_undeformed_skin(name):
     scene = cliff(name)
-    depth = integrate_discontinuities(noisy(scene), PITCH, scene.contact)
-    assert depth[~scene.contact].abs().max() == 0
+    depth = integrate(noisy(scene))
+    beside = torch.nn.functional.max_pool2d(scene.contact.float(), 5, 1, 2) == 0
+    assert depth[beside].abs().max() == 0
 
 
 def test_no_contact_and_all_contact():
-    assert integrate_discontinuities(torch.zeros(2, 2, 9, 12)).abs().max() == 0
+    assert integrate(torch.zeros(1, 2, 9, 12)).abs().max() == 0
     tilt = torch.full((1, 2, 9, 12), 0.1, dtype=torch.float64)
-    assert (integrate_discontinuities(tilt, 0.5) - vts.poisson_background(tilt, 0.5)).abs().max() < 1e-3
-
-
-def test_items_of_a_batch_are_independent_and_report_their_own_status():
-    gradient = torch.cat((cliff("wedge").gradient, torch.zeros(1, 2, *SIZE, dtype=torch.float64), SMOOTH["sphere"]().gradient))
-    solver = DiscontinuityIntegration(PITCH)
-    whole = solver.solve(gradient)
-    single = [solver.solve(gradient[i : i + 1]) for i in range(3)]
-    assert torch.equal(whole.depth_mm, torch.cat([one.depth_mm for one in single]))
-    assert whole.iterations.tolist() == [int(one.iterations) for one in single]
-    assert whole.converged.all() and whole.passes.tolist()[1] == 0 and whole.passes.min() < whole.passes.max()
-    hurried = DiscontinuityIntegration(PITCH, max_passes=1).solve(gradient[:1])
-    assert hurried.passes.tolist() == [1] and hurried.converged.tolist() == [False]
+    assert (integrate(tilt) - vts.poisson_background(tilt, PITCH)).abs().max() < 1e-3
 
 
 def test_single_precision_follows_double_precision():
     gradient = noisy(cliff("cylinder"))
-    exact = integrate_discontinuities(gradient, PITCH)
-    single = integrate_discontinuities(gradient.float(), PITCH)
+    exact, single = integrate(gradient), integrate(gradient.float())
     assert single.dtype == torch.float32 and (single.double() - exact).abs().max() < 0.1 * PITCH
 
 
 def test_a_flipped_image_gives_flipped_depth():
     gradient = noisy(cliff("wedge"))
     flipped = -gradient.flip(2, 3)
-    difference = integrate_discontinuities(flipped, PITCH) - integrate_discontinuities(gradient, PITCH).flip(2, 3)
+    difference = integrate(flipped) - integrate(gradient).flip(2, 3)
     assert difference.abs().max() < 0.05 * PITCH
 
 
-def test_pixels_without_weight_are_bridged():
-    scene = SMOOTH["sphere"]()
-    gradient, weight = scene.gradient.clone(), torch.ones_like(scene.depth_mm)
-    gradient[:, :, 50:58, 70:90] = 5.0
-    weight[:, :, 50:58, 70:90] = 0.0
-    bridged, misled = (integrate_discontinuities(gradient, PITCH, weight=weight), integrate_discontinuities(gradient, PITCH))
-    sound = weight.bool()
-    assert metrics.depth_error(bridged, scene.depth_mm, PITCH, sound).max_px < 0.1
-    assert metrics.depth_error(bridged, scene.depth_mm, PITCH, ~sound).max_px < 0.7
-    assert metrics.depth_error(misled, scene.depth_mm, PITCH, ~sound).max_px > 2.0
-
-
-def test_a_gradient_flows_back_with_the_weights_held():
+def test_a_gradient_flows_back_with_the_weights_held(monkeypatch):
     gradient = noisy(cliff("wedge")).requires_grad_()
-    depth = DiscontinuityIntegration(PITCH, max_passes=1).solve(gradient).depth_mm
+    depth = vts.AdaptiveIntegration(PITCH)(gradient)
     (slope,) = torch.autograd.grad((depth * torch.sin(torch.arange(160.0, dtype=torch.float64))).sum(), gradient)
     assert bool(torch.isfinite(slope).all()) and slope.abs().max() > 0
     # with weights held, depth is linear in the gradient: its product with the derivative is the depth itself
-    depth = DiscontinuityIntegration(PITCH, residual=1e-9).solve(gradient).depth_mm
+    monkeypatch.setattr(discontinuities, "RESIDUAL", 1e-9)
+    depth = integrate(gradient)
     (along,) = torch.autograd.grad(depth.sum(), gradient)
     assert float((along * gradient.detach()).sum()) == pytest.approx(float(depth.detach().sum()), rel=1e-6)
 
@@ -198,10 +176,10 @@ def test_the_sign_of_cliffs_fires_on_cliffs(name, std):
 
 
 def test_adaptive_integration_is_poisson_on_smooth_frames_and_robust_on_others():
-    smooth, steep = SMOOTH["sphere"]().gradient, cliff("wedge").gradient
-    depth = vts.AdaptiveIntegration(PITCH)(torch.cat((smooth, steep)))
+    smooth, frames = SMOOTH["sphere"]().gradient, [cliff(name).gradient for name in CLIFFS]
+    depth = vts.AdaptiveIntegration(PITCH)(torch.cat((smooth, *frames)))
     assert (depth[:1] - vts.poisson_background(smooth, PITCH)).abs().max() < 1e-12
-    assert torch.equal(depth[1:], integrate_discontinuities(steep, PITCH))
+    assert torch.equal(depth[1:], torch.cat([integrate(frame) for frame in frames]))
 
 
 @pytest.mark.parametrize("center_mm", [(-17.0, 4.0), (18.0, -13.0)])
@@ -212,8 +190,8 @@ def test_contact_at_the_image_border_wants_a_free_border(center_mm, ring):
     calibration = vts.Calibration.from_lights(ring(), vts.Sensor("rig", *SIZE, PITCH), rest)
     image = scenes.render(scene, ring(), noise_std=0.005, bits=8)
     free, zero = (
-        largest_px(vts.DepthPipeline.from_calibration(calibration, "precise", integrate=integrate(PITCH))(image).depth_mm, scene)
-        for integrate in (vts.PoissonBackground, vts.PoissonDST)
+        largest_px(vts.DepthPipeline.from_calibration(calibration, "precise", integrate=block(PITCH))(image).depth_mm, scene)
+        for block in (vts.PoissonBackground, vts.PoissonDST)
     )
     assert free < 0.5 * zero and free < 0.5
 
@@ -244,8 +222,8 @@ def test_a_pinhole_is_as_good_as_an_orthographic_camera(camera_height_mm, center
     calibration = vts.Calibration.from_lights(ring(), vts.Sensor("rig", 240, 320, 0.125))
     image = scenes.render(scene, ring())
     normals = NormalFromIntensity.from_calibration(calibration, camera_height_mm)
-    integrate = PerspectiveIntegration(0.125, camera_height_mm)
-    right = vts.DepthPipeline.from_calibration(calibration, "precise", normals=normals, integrate=integrate)(image)
+    through = PerspectiveIntegration(0.125, camera_height_mm)
+    right = vts.DepthPipeline.from_calibration(calibration, "precise", normals=normals, integrate=through)(image)
     wrong = vts.DepthPipeline.from_calibration(calibration, "precise")(image)
     error = [metrics.depth_error(out.depth_mm, scene.depth_mm, 0.125).max_px for out in (right, wrong)]
     assert error[0] < 0.3 and error[0] < error[1] / 3
@@ -266,5 +244,4 @@ def test_a_ramp_stands_on_its_low_end(slope):
     """Cliffs on three sides, as high at one end as the ramp is; upside down it would hang from there."""
     ramp = vts.scenes.surface(lambda x, y: torch.where((y.abs() < 2.5) & (x.abs() < 3), (x + 3) * slope, -1.0), 120, 160, 0.1)
     smooth = (vts.poisson_background(ramp.gradient, 0.1) - ramp.depth_mm).abs().max()
-    for found in (integrate_discontinuities(ramp.gradient, 0.1, ramp.contact), vts.AdaptiveIntegration(0.1)(ramp.gradient)):
-        assert (found - ramp.depth_mm).abs().max() < 0.02 * smooth
+    assert (vts.AdaptiveIntegration(0.1)(ramp.gradient) - ramp.depth_mm).abs().max() < 0.02 * smooth

@@ -10,8 +10,8 @@ import torch
 
 import torchvts as vts
 from lab import metrics
-from torchvts.integration import PerspectiveIntegration, divergence, integrate_discontinuities
-from torchvts.integration.poisson import laplace_plan
+from torchvts.integration import PerspectiveIntegration, divergence
+from torchvts.integration.poisson import plan_dct
 from torchvts.integration.screened import solve_screened
 
 SIZES = [(3, 3), (4, 4), (5, 8), (8, 5), (7, 11), (13, 13), (12, 10), (3, 16), (15, 14), (9, 6)]
@@ -141,7 +141,7 @@ def test_a_module_equals_its_function_whatever_size_it_saw_before(module):
         assert float((block(gradient) - function(gradient, 0.3)).abs().max()) < 1e-6  # compiled kernels round differently
 
 
-FUNCTIONS = (vts.poisson_dst, vts.poisson_dct, vts.poisson_background, integrate_discontinuities)
+FUNCTIONS = (vts.poisson_dst, vts.poisson_dct, vts.poisson_background)
 MODULES = (vts.PoissonDCT(0.3), vts.PoissonBackground(0.3), vts.AdaptiveIntegration(0.3), PerspectiveIntegration(0.3, 30.0))
 
 
@@ -209,7 +209,7 @@ def test_known_depth_that_does_not_settle_is_told():
     depth, gradient = tilted()
     right, pull = 0.2 * divergence(gradient), 0.04 * KNOWN_AT["a fixed half"]
     with pytest.warns(UserWarning, match="known_weight: the depth of 1 of 1 frames has not settled in 3 steps"):
-        solve_screened(right, pull, depth, laplace_plan(gradient), 1e-10, max_iterations=3)
+        solve_screened(right, pull, depth, plan_dct(gradient, 24, 31), 1e-10, max_iterations=3)
 
 
 def test_known_depth_seen_by_a_pinhole_keeps_its_height():

@@ -92,7 +92,7 @@ def poisson_dct(gradient: Tensor, mm_per_pixel: float = 1.0) -> Tensor:
     check_gradient(gradient, 2)
     if not torch.jit.is_scripting():
         mm_per_pixel = check_positive("mm_per_pixel", mm_per_pixel)
-    return _integrate_dct(gradient, mm_per_pixel, _plan_dct(_wide(gradient), gradient.shape[2], gradient.shape[3]), False)
+    return _integrate_dct(gradient, mm_per_pixel, plan_dct(_wide(gradient), gradient.shape[2], gradient.shape[3]), False)
 
 
 def poisson_background(gradient: Tensor, mm_per_pixel: float = 1.0) -> Tensor:
@@ -116,7 +116,7 @@ def poisson_background(gradient: Tensor, mm_per_pixel: float = 1.0) -> Tensor:
     check_gradient(gradient, 2)
     if not torch.jit.is_scripting():
         mm_per_pixel = check_positive("mm_per_pixel", mm_per_pixel)
-    return _integrate_dct(gradient, mm_per_pixel, _plan_dct(_wide(gradient), gradient.shape[2], gradient.shape[3]), True)
+    return _integrate_dct(gradient, mm_per_pixel, plan_dct(_wide(gradient), gradient.shape[2], gradient.shape[3]), True)
 
 
 class PoissonDST(Integrator):
@@ -158,7 +158,7 @@ class PoissonDCT(Integrator):
         super().__init__()
         self.mm_per_pixel = check_positive("mm_per_pixel", mm_per_pixel)
         self.zero_in_background = False
-        self._plan: list[Tensor] = _plan_dct(torch.zeros(1, dtype=torch.float64), 2, 2)
+        self._plan: list[Tensor] = plan_dct(torch.zeros(1, dtype=torch.float64), 2, 2)
 
     def forward(self, gradient: Tensor, known_mm: Tensor | None = None, known_weight: Tensor | None = None) -> Tensor:
         """Depth in mm, (B, 1, H, W).
@@ -178,7 +178,7 @@ class PoissonDCT(Integrator):
         height, width = gradient.shape[2], gradient.shape[3]
         plan, like = self._plan, _wide(gradient)
         if not _plan_fits(plan, like, height, width):
-            plan = _kept(_plan_dct(like, height, width))
+            plan = _kept(plan_dct(like, height, width))
             if _plain(plan[2]):
                 self._plan = plan
         if known_mm is None or known_weight is None:
@@ -241,16 +241,6 @@ def _wide(gradient: Tensor) -> Tensor:
     return widened(gradient.narrow(0, 0, 0))
 
 
-def laplace_plan(like: Tensor) -> list[Tensor]:
-    """What :func:`solve_laplace` needs for images of the size, dtype and device of ``like`` (B, C, H, W)."""
-    return _plan_dct(like, like.shape[2], like.shape[3])
-
-
-def solve_laplace(right: Tensor, plan: list[Tensor]) -> Tensor:
-    """(B, 1, H, W) of zero mean whose five-point Laplacian with a free border is ``right`` less its mean."""
-    return solve_by_fft(right, plan)
-
-
 def _kept(plan: list[Tensor]) -> list[Tensor]:
     """A plan that later calls, which may record gradients, can use: tensors made under inference mode refuse that."""
     if not torch.jit.is_scripting():  # noqa: SIM102
@@ -274,7 +264,7 @@ def _plan_dst(gradient: Tensor) -> list[Tensor]:
     return _plan([even_y, odd_y], [value_even_y, value_odd_y], [even_x, odd_x], [value_even_x, value_odd_x], gradient)
 
 
-def _plan_dct(like: Tensor, height: int, width: int) -> list[Tensor]:
+def plan_dct(like: Tensor, height: int, width: int) -> list[Tensor]:
     """The seven tables of :func:`solve_by_fft`, of the dtype and on the device of ``like``."""
     order = [reordering(height).to(like.device), reordering(width).to(like.device)]
     kind = torch.complex128 if like.dtype == torch.float64 else torch.complex64

@@ -256,6 +256,16 @@ def test_a_background_of_another_unit_shows_hardly_any_dot_and_none_in_silence()
     assert float(moved.seen.double().mean()) < 0.5
 
 
+def test_motion_counts_from_the_background_where_that_was_pressed_too():
+    background = CLEAN.image(PRESS)
+    markers = FillMarkers.from_background(background)
+    dots = find_dots(background, markers)
+    moved = SkinMotion(background, dots, markers.diameter_px, PITCH, (0.0, 0.0, math.inf))(*frame(CLEAN, None))
+    rest = moved.rest_mm + moved.displacement_mm[0, :, :2]
+    error = (moved.displacement_mm[0, :, :2] + PRESS.displacement_mm(rest.double())[:, :2])[moved.seen[0]]
+    assert int(moved.seen.sum()) > 50 and float(error.square().mean().sqrt()) < 0.05 * PITCH
+
+
 def test_wrong_frames_are_refused():
     skin = DottedSkin(**SIZE)
     motion, (images, depth) = motion_of(skin), frame(skin, PRESS)

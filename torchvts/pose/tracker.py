@@ -11,8 +11,10 @@ from torch import Tensor
 
 from ..core.checks import check_positive
 from ..core.geometry import check_rigid
+from ..skin import DotMotion
 from .ambiguity import UNKNOWN_VARIANCE
 from .direct import equal_poses, likely_poses, message_of, symmetries
+from .dots import carried, fused, points_under
 from .follow import TRUSTED_DEG, TRUSTED_MM, Followed, follow, in_common
 from .grids import LEAST_CELLS, DepthFrame, Grids, Surface, Unusable, grids, pitch_by_slopes, surface_of
 from .inverse import LEAST_FITNESS, LEAST_NOISE, LEAST_OVERLAP, MOST_COST
@@ -88,10 +90,14 @@ class PoseTracker:
     that. A pose that contradicts the frame is not returned: ``lost`` says why, and the next frames are searched as
     :func:`register_depth` does, until the object is found.
     Of a symmetric object it may then be found in another of its equal poses: from there on ``alternatives`` lists the others.
+    Where the printed dots of the skin are given, too, they are one more measurement: each pose is fused with the one that the dots
+    under the object have carried on from the reference, as long as they do not contradict the contact. ``covariance`` then holds if
+    the skin sticks: slip along a motion that the contact does not show is not seen, and ``converged`` does not count on dots.
 
     Args:
         reference: the first frame, a :class:`torchvts.DepthOutput` or any object with its depth_mm, gradient and contact.
         mm_per_pixel: pitch of all frames, mm.
+        moved: motion of the dots in the reference, of :class:`torchvts.SkinMotion`; None for none.
     Attributes:
         graph: the keyframes and their poses.
         closures: how far each closed loop contradicted the poses before, (degrees, mm).
@@ -112,11 +118,11 @@ class PoseTracker:
         False
     """
 
-    def __init__(self, reference: DepthFrame, mm_per_pixel: float) -> None:
+    def __init__(self, reference: DepthFrame, mm_per_pixel: float, moved: DotMotion | None = None) -> None:
         self.mm_per_pixel = check_positive("mm_per_pixel", mm_per_pixel)
-        self.reset(reference)
+        self.reset(reference, moved)
 
-    def reset(self, reference: DepthFrame) -> None:
+    def reset(self, reference: DepthFrame, moved: DotMotion | None = None) -> None:
         """Begin anew with another reference; all keyframes are forgotten."""
         frame = surface_of(reference, "reference")
         slope = float(frame.gradient[0][:, frame.contact[0, 0]].square().mean().sqrt())
@@ -145,16 +151,20 @@ class PoseTracker:
         self._symmetries: list[Array] = []
         self._symmetries_of_reference: list[Array] | None = None
         self._usual: deque[tuple[float, float]] = deque(maxlen=30)  # slope noise and cost
+        self._dots = None if moved is None else points_under(moved, frame.contact)
+        self._carried: Array | None = None  # the last pose, moved with the dots
+        self._by_dots: Array | None = np.zeros((6, 6))  # covariance of what dots have told since the reference
 
     def restart(self, T_target_source: Tensor) -> None:
         """Track on from a pose of the reference, (4, 4), such as one that the robot's arm reports."""
         self._poses, self._tracking, self._symmetries = [check_rigid("T_target_source", T_target_source).numpy().copy()], True, []
 
-    def __call__(self, frame: DepthFrame) -> TrackedPose:
+    def __call__(self, frame: DepthFrame, moved: DotMotion | None = None) -> TrackedPose:
         """Pose of the reference in a frame.
 
         Args:
             frame: one frame, as the reference.
+            moved: motion of the dots in it; None for none.
         Returns:
             The pose; ``lost`` says why there is none.
         Raises:
@@ -173,6 +183,13 @@ class PoseTracker:
         made = grids(contact, self.mm_per_pixel, resolution)
         if made.touching < LEAST_CELLS:
             return self._lose(f"hardly any contact deeper than {resolution.least_mm:.2g} mm", contact)
+        before, self._dots = self._dots, None if moved is None else points_under(moved, contact.contact)
+        step = None if before is None or self._dots is None or not self._tracking else carried(before, self._dots)
+        if step is None or self._by_dots is None:
+            self._carried = self._by_dots = None
+        else:
+            self._carried = step[0] @ self._poses[-1]
+            self._by_dots = moved_covariance(step[0], self._by_dots) + step[1]
         return self._track(contact, made) if self._tracking else self._search(contact, made)
 
     def _track(self, contact: Surface, frame: Grids) -> TrackedPose:
@@ -193,8 +210,16 @@ class PoseTracker:
         return self._accept(contact, frame, found)
 
     def _follow(self, index: int, frame: Grids, starts: list[Array]) -> Followed:
-        to_reference = inverted(self.graph.poses[index])
-        return follow(self.graph.keyframes[index], frame, [start @ to_reference for start in starts])
+        """Register to a keyframe; what is unknown follows the dots, unless they contradict what is known: then the object slips."""
+        to_reference, keyframe = inverted(self.graph.poses[index]), self.graph.keyframes[index]
+        poses = [start @ to_reference for start in starts]
+        if self._carried is not None:
+            expected = self._carried @ to_reference
+            found = follow(keyframe, frame, [expected, *poses])
+            if distance_mm(keyframe.spread, expected, found.pose) < TRUSTED_MM:
+                return found
+            self._carried = self._by_dots = None
+        return follow(keyframe, frame, poses)
 
     def _older_keyframe(self, frame: Grids, expected: Array) -> int | None:
         """The oldest keyframe before the present one that has much in common with the frame, and shows its pose no worse."""
@@ -297,9 +322,11 @@ class PoseTracker:
         """Keep a pose, take a keyframe if it is time, and describe the pose."""
         graph, index = self.graph, self._active
         pose = orthonormal(found.pose @ graph.poses[index])
-        drift, drift_deg, drift_mm = self._drift(found)
+        keyframe, (drift, drift_deg, drift_mm) = graph.keyframes[index], self._drift(found)
+        covariance = found.covariance + drift
+        if self._carried is not None and self._by_dots is not None:
+            pose, covariance = fused(pose, covariance, self._carried, self._by_dots)
         self._poses = [*self._poses[-1:], pose]
-        keyframe = graph.keyframes[index]
         if distance_mm(keyframe.spread, found.pose, np.eye(4)) > MOVED_MM:
             self._usual.append((found.fine.slope_noise, found.score.cost))
         large = frame.touching > LEAST_CONTACT * graph.keyframes[0].grids.touching
@@ -313,7 +340,8 @@ class PoseTracker:
         exact = found.exact and 3.0 * std_deg <= TRUSTED_DEG and 3.0 * std_mm <= TRUSTED_MM
         message = f"{100 * found.score.fitness:.0f} % of the common contact agrees"
         if found.names:
-            message += f"; kept, because the surface slides on itself: {', '.join(found.names)}"
+            by = "kept" if self._by_dots is None else "by the dots"
+            message += f"; {by}, because the surface slides on itself: {', '.join(found.names)}"
         if not exact:
             by_drift = found.exact or (drift_deg > found.std_deg and 3.0 * drift_deg > TRUSTED_DEG)
             reason = "the way over keyframes adds up" if by_drift else "parts of the contact disagree"
@@ -326,7 +354,7 @@ class PoseTracker:
             fitness=found.score.fitness,
             converged=exact,
             message=message,
-            covariance=torch.from_numpy(found.covariance + drift),
+            covariance=torch.from_numpy(covariance),
             ambiguous=found.names,
             alternatives=[torch.from_numpy(pose @ other) for other in self._symmetries],
             overlap=found.score.overlap,

@@ -102,13 +102,7 @@ class DotMotion(NamedTuple):
         Raises:
             ValueError: another size or number of frames. TypeError: not bool.
         """
-        check_mask("contact", contact)
-        check_batch("contact", contact.to(self.rest_mm.dtype), 1)
-        check_same_size("contact", contact, "images", self.height, self.width)
-        if contact.shape[0] != len(self.seen):
-            raise ValueError(
-                f"contact: expected {len(self.seen)} frames like the motion, got {contact.shape[0]}: of another batch?"
-            )
+        touched = self.touched(contact)
         x, y = self._grid()
         places = torch.cartesian_prod(y, x).flip(1)
         mean, variance = self.at(places)
@@ -119,11 +113,21 @@ class DotMotion(NamedTuple):
             for one, m, v, turn in zip(inside, mean, variance, turns, strict=True)
         ]
         shift, turn, pivot, share = (torch.stack(part) for part in zip(*found, strict=True))
-        touched = self._under(contact, self.rest_mm + self.displacement_mm[..., :2]) & self.seen
         offset = self.rest_mm - pivot[:, None]
         moved = _turned(offset, turn[:, None]) - offset + shift[:, None]
         slip = torch.where(touched[..., None], moved - self.displacement_mm[..., :2], math.nan)
         return Slip(shift, torch.rad2deg(turn), share, slip)
+
+    def touched(self, contact: Tensor) -> Tensor:
+        """Which dots are seen in contact, (B, N) bool; arguments and errors are those of :meth:`slip`."""
+        check_mask("contact", contact)
+        check_batch("contact", contact.to(self.rest_mm.dtype), 1)
+        check_same_size("contact", contact, "images", self.height, self.width)
+        if contact.shape[0] != len(self.seen):
+            raise ValueError(
+                f"contact: expected {len(self.seen)} frames like the motion, got {contact.shape[0]}: of another batch?"
+            )
+        return self._under(contact, self.rest_mm + self.displacement_mm[..., :2]) & self.seen
 
     def spacing_mm(self) -> float:
         """Usual distance of neighbouring dots."""

@@ -4,12 +4,11 @@ import dataclasses
 
 import pytest
 import torch
-from test_frozen import MODES, lights_unit, response_unit
+from test_frozen import MODES, lights_unit, marked_unit, response_unit
 
 import torchvts as vts
 from torchvts.compiled import library
 from torchvts.core.files import read_image
-from torchvts.model.markers import FillMarkers
 from torchvts.stream import with_background
 
 pytestmark = pytest.mark.skipif(library() is None, reason="no compiled library")
@@ -55,6 +54,16 @@ def test_a_drawn_unit_on_another_day(mode, size):
     assert differs(found, frozen(with_background(calibration, image), mode), images) > 0.2
 
 
+@pytest.mark.parametrize("mode", MODES)
+def test_a_skin_with_markers_on_another_day(mode):
+    calibration, images = marked_unit((120, 160), 0.125)
+    image = (0.9 * calibration.printed).clamp(0.0, 1.0)
+    expected = with_background(calibration, image)
+    found = frozen(calibration, mode).with_background(image)
+    assert expected.markers.to_dict() == pytest.approx(calibration.markers.to_dict(), rel=0.05)  # Python measures them again
+    assert differs(found, frozen(dataclasses.replace(expected, markers=calibration.markers), mode), images, 1e-5) > 0.2
+
+
 def test_the_camera_has_a_gamma():
     calibration, images = response_unit((99, 131), 0.15)
     response = dataclasses.replace(calibration.response, gamma=2.2)
@@ -90,16 +99,13 @@ def test_what_it_makes_is_a_plan_and_the_old_one_stays(tmp_path):
 
 def test_what_no_background_is_is_refused():
     calibration, _ = response_unit((24, 32), 0.5)
-    pipe = vts.DepthPipeline.from_calibration(calibration)
-    good, found = calibration.background, pipe.freeze()
-    pipe.compensate.linear.insert(0, FillMarkers())
+    good, found = calibration.background, frozen(calibration)
     slow = vts.DepthPipeline.from_calibration(calibration, integrate=vts.PoissonDST(0.5)).freeze()
     for unit, image, reason in (
         (found, good[:, :20], r"background: expected \(3, 24, 32\) for sensor 'soft', got \(3, 20, 32\)"),
         (found, 255.0 * good, r"background: expected values in \[0, 1\]"),
         (found, torch.zeros_like(good), "background: image: expected light above the noise, got none: black image"),
         (frozen(lights_unit((24, 32), 0.5)[0]), good, "background: the plan is one of point lights"),
-        (pipe.freeze(), good, "pipe: expected a skin without printed markers"),
         (slow, good, "pipe: expected one that is compiled, got one in PyTorch, because integrate is PoissonDST"),
     ):
         with pytest.raises(ValueError, match=reason):

@@ -1,6 +1,7 @@
 """A frozen pipeline: the plain one's depth, compiled; a copy that nothing changes."""
 
 import copy
+import dataclasses
 import multiprocessing
 import pickle
 import re
@@ -20,6 +21,7 @@ from lab import frames
 from torchvts.compiled import binding, library, plan
 from torchvts.compiled import library as library_of
 from torchvts.compiled.binding import LIBRARY
+from torchvts.core.files import read_image
 from torchvts.model.response_field import DepthBrightness, ResponseField, ResponseModel
 from torchvts.skin import weight as skin_weight
 
@@ -103,6 +105,22 @@ def response_unit(size, pitch, products=2, cubes=-1):
     frames = torch.stack([background * (1.0 + level * change) * (1.0 + drift) for level, drift in levels])
     noisy = frames + 0.004 * torch.randn(frames.shape, generator=generator)
     return calibration, (noisy.clamp(0.0, 1.0) * 255.0).round() / 255.0
+
+
+def dotted(images, side):
+    """Images with printed dots of a side, four sides apart, a third as bright."""
+    dots = torch.zeros(images.shape[-2:])
+    for y, x in ((y, x) for y in range(side, dots.shape[0] - side, 4 * side) for x in range(side, dots.shape[1] - side, 4 * side)):
+        dots[y : y + side, x : x + side] = 1.0
+    return (images * (1.0 - 0.65 * dots) * 255.0).round() / 255.0
+
+
+def marked_unit(size, pitch, side=3):
+    """A unit by a response field with printed dots, and its images."""
+    calibration, images = response_unit(size, pitch)
+    sensor = dataclasses.replace(calibration.sensor, markers=True)
+    background = dotted(calibration.background, side)
+    return vts.Calibration.from_response(calibration.response, sensor, background), dotted(images, side)
 
 
 UNITS = {"lights": lights_unit, "response": response_unit}
@@ -193,6 +211,15 @@ def test_the_shadows_of_a_user_run_in_pytorch():
 
 
 @pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("side, size", [(3, (99, 131)), (5, (120, 160)), (18, (240, 321)), (26, (300, 401))], ids=str)
+def test_printed_markers(mode, side, size):
+    calibration, images = marked_unit(size, 20.0 / size[1], side)
+    assert calibration.markers.diameter_px > 0.5 * side
+    found, _ = agree(vts.DepthPipeline.from_calibration(calibration, mode), images[:2])
+    assert 0.1 < float(found.depth_mm.max()) < 2.0
+
+
+@pytest.mark.parametrize("mode", MODES)
 def test_a_pinhole_camera_and_other_integrators(mode):
     calibration, images = lights_unit((96, 128), 0.25)
     normals = vts.NormalFromIntensity.from_calibration(calibration, camera_height_mm=60.0)
@@ -212,6 +239,16 @@ def test_the_real_mini(data):
         for mode in MODES:
             found, _ = agree(vts.DepthPipeline.from_calibration(unit.calibration, mode), unit.image)
             assert float(found.depth_mm.max()) > 0.2
+
+
+@pytest.mark.parametrize("name, rest", [("gelslim_markers", "ref.jpg"), ("wyh_wedge_markers", "background.png")])
+def test_real_markers(data, name, rest):
+    """Presses of skins with printed dots, whose response nobody knows: by that of a Mini, only their filling is tested."""
+    background, *images = (read_image(path) for path in [data / name / rest, *sorted((data / name).glob("*"))[-3:]])
+    sensor = vts.Sensor(name, *background.shape[1:], 0.05, markers=True)
+    unit = vts.Calibration.from_response(vts.Sensor.load("gelsight_mini").prior.response, sensor, background)
+    found, plain = agree(vts.DepthPipeline.from_calibration(unit), torch.stack(images))
+    assert float((found.depth_mm - plain.depth_mm).abs().max()) <= 1e-6 < float(found.depth_mm.max())
 
 
 # ---- a copy ----

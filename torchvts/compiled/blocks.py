@@ -12,6 +12,7 @@ from ..core.blur import gaussian_weights
 from ..core.cells import whole_cell_means
 from ..core.geometry import CLIFF_SLOPE, MAX_SLOPE, GradientFromNormal
 from ..integration import PoissonBackground, PoissonDCT
+from ..model import FillMarkers
 from ..normals import NormalFromIntensity, NormalFromResponse
 from ..normals import shadowed as shadowed_module
 from ..normals.base import WrappedNormals
@@ -78,7 +79,7 @@ def _floats(values: object, dtype: torch.dtype = torch.float32) -> Tensor:
 
 
 def compensate_values(block: nn.Module, size: tuple[int, int]) -> Values:
-    """Of :class:`Compensate`, but for the markers, which PyTorch fills."""
+    """Of :class:`Compensate`."""
     check_block("compensate", block, Compensate)
     assert isinstance(block, Compensate)
     gain = block.gain
@@ -109,17 +110,21 @@ def compensate_values(block: nn.Module, size: tuple[int, int]) -> Values:
 
 
 def _light_values(linear: nn.ModuleList) -> Values:
-    """The light of camera values, as a table, where the last step before linear light is the camera's gamma."""
-    if not ends_in_gamma(linear):
-        return {"exponent": 1.0, "light_of": None, "lights": 0}
-    check_block("compensate.linear", linear[-1], Linearise)
-    light = linear[-1](torch.linspace(0.0, 1.0, LIGHTS, dtype=torch.float64)).float()
-    return {"exponent": linear[-1].gamma, "light_of": light, "lights": LIGHTS}
+    """What fills markers, and the light of camera values as a table."""
+    values: Values = dict.fromkeys(_MARKERS, 0.0) | {"exponent": 1.0, "light_of": None, "lights": 0}
+    if [type(step) for step in linear] not in ([], [FillMarkers], [Linearise], [FillMarkers, Linearise]):
+        raise NotCompiled(f"compensate.linear is {', '.join(type(step).__name__ for step in linear)}")
+    for k, step in enumerate(linear):
+        check_block(f"compensate.linear.{k}", step, FillMarkers, Linearise)
+        if isinstance(step, FillMarkers):
+            values |= {field: getattr(step, name) for field, name in _MARKERS.items()}
+        else:
+            light = step(torch.linspace(0.0, 1.0, LIGHTS, dtype=torch.float64)).float()
+            values |= {"exponent": step.gamma, "light_of": light, "lights": LIGHTS}
+    return values
 
 
-def ends_in_gamma(linear: nn.ModuleList) -> bool:
-    """Whether the last step before linear light is the camera's gamma, which is compiled; what stands before it PyTorch does."""
-    return len(linear) > 0 and isinstance(linear[-1], Linearise)
+_MARKERS = {f"marker_{name.removesuffix('_px')}": name for name in FillMarkers().to_dict()}
 
 
 def _pedestals(gain: Tensor | None, offset: Tensor | None) -> Tensor | None:

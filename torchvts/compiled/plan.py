@@ -155,7 +155,7 @@ class Plan:
         """Reconstruct a frame; False if its values are not finite and in [0, 1].
 
         Args:
-            image: (3, H, W), its markers filled, contiguous float32 as all tensors here but for masks.
+            image: (3, H, W), contiguous float32 as all tensors here but for masks.
             conditions: (22,), gets the light (3, 6), what is lost (3), and the slope that could not be seen.
             output: depth (1, H, W), gradient (2, H, W), normal (3, H, W), contact and deformed (1, H, W), which get the result.
         Raises:

@@ -7,10 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.autograd import forward_ad
 
-from ..compensate import Compensate
 from ..compiled import NotCompiled, Plan, PlanError, check_block, library, plan_bytes, why_no_library
 from ..compiled import blocks as compiled
 from ..core import __version__
@@ -33,8 +32,6 @@ class FrozenPipeline:
     threads as torch uses, and equal bit for bit those frames alone. Depth differs from the pipeline's by rounding: less than
     1e-5 mm, and up to 2e-3 mm where a light has failed or an image is saturated, so that slopes are hardly determined.
 
-    Markers are filled by PyTorch, before the compiled code.
-
     Args:
         pipe: the pipeline.
     Attributes:
@@ -46,7 +43,7 @@ class FrozenPipeline:
         ValueError: parameters that record gradients. TypeError: no pipeline.
     """
 
-    __slots__ = ("_before", "_pipe", "_plan", "compiled", "mm_per_pixel", "mode", "not_compiled")
+    __slots__ = ("_pipe", "_plan", "compiled", "mm_per_pixel", "mode", "not_compiled")
 
     compiled: bool
     not_compiled: str
@@ -54,7 +51,6 @@ class FrozenPipeline:
     mm_per_pixel: float
     _pipe: DepthPipeline | None
     _plan: Plan | None
-    _before: nn.Sequential
 
     def __init__(self, pipe: DepthPipeline) -> None:
         check_record("pipe", pipe, DepthPipeline, "DepthPipeline.from_calibration makes one")
@@ -71,19 +67,12 @@ class FrozenPipeline:
                 plan = Plan(plan_bytes(values_of(own), about(own)))
             except (NotCompiled, PlanError) as error:
                 reason = str(error)
-        before: list[nn.Module] = []
-        if plan is not None and isinstance(own.compensate, Compensate):
-            steps = own.compensate.linear
-            before = list(steps[:-1] if compiled.ends_in_gamma(steps) else steps)
-        self._hold(own, plan, before, reason, own.mode, own.mm_per_pixel)
+        self._hold(own, plan, reason, own.mode, own.mm_per_pixel)
 
-    def _hold(
-        self, pipe: DepthPipeline | None, plan: Plan | None, before: list[nn.Module], reason: str, mode: str, mm_per_pixel: float
-    ) -> None:
+    def _hold(self, pipe: DepthPipeline | None, plan: Plan | None, reason: str, mode: str, mm_per_pixel: float) -> None:
         given: dict[str, object] = {
             "_pipe": pipe,
             "_plan": plan,
-            "_before": nn.Sequential(*before),
             "compiled": plan is not None,
             "not_compiled": reason,
             "mode": mode,
@@ -96,7 +85,7 @@ class FrozenPipeline:
         """Write the plan: one file that Python, C, robots and web pages read, see docs/plan.md; whole or not at all.
 
         Raises:
-            ValueError: what is not compiled, or printed markers, which PyTorch fills.
+            ValueError: a pipeline that is not compiled.
             OSError: it cannot be written there.
         """
         plan = self._check_plan()
@@ -134,19 +123,20 @@ class FrozenPipeline:
     @classmethod
     def _of(cls, plan: Plan) -> "FrozenPipeline":
         found = cls.__new__(cls)
-        found._hold(None, plan, [], "", str(plan.about.get("mode", "unknown")), plan.mm_per_pixel)
+        found._hold(None, plan, "", str(plan.about.get("mode", "unknown")), plan.mm_per_pixel)
         return found
 
     def with_background(self, background: Tensor) -> "FrozenPipeline":
         """The same unit with another image without contact, as of a later day: by the plan alone, in C; this one stays as it is.
 
-        What :func:`torchvts.stream.with_background` does with the calibration, for units by a response field.
+        What :func:`torchvts.stream.with_background` does with the calibration, for units by a response field. Printed markers are
+        taken to be those of the plan.
 
         Args:
             background: (3, H, W) in [0, 1].
         Raises:
-            ValueError: another shape, values outside [0, 1], no light; or a unit by point lights, printed markers, or a pipeline
-                that is not compiled.
+            ValueError: another shape, values outside [0, 1], no light; or a unit by point lights, or a pipeline that is not
+                compiled.
         Example:
             >>> frozen = FrozenPipeline.load("unit.plan").with_background(background)  # doctest: +SKIP
         """
@@ -159,15 +149,10 @@ class FrozenPipeline:
         return self._of(found)
 
     def _check_plan(self) -> Plan:
-        """The plan, or raise where it does not say all of a frame."""
+        """The plan, or raise where there is none."""
         if self._plan is None:
             why = f"got one in PyTorch, because {self.not_compiled}"
             raise ValueError(f"pipe: expected one that is compiled, {why}: torchvts.export writes others")
-        if len(self._before):
-            raise ValueError(
-                "pipe: expected a skin without printed markers, got one whose markers PyTorch fills before the compiled code: "
-                "torchvts.export.export_torchscript writes a file that holds them"
-            )
         return self._plan
 
     def __setattr__(self, name: str, value: object) -> None:
@@ -213,9 +198,6 @@ class FrozenPipeline:
             return self._in_pytorch(images), Conditions(*(part.clone() for part in seen))
         with torch.inference_mode():
             images = images.resolve_neg().contiguous()
-            if len(self._before):
-                check_range("images", images)
-                images = self._before(images).contiguous()
         count, size = images.shape[0], self._plan.size
         kinds = (torch.float32, torch.float32, torch.float32, torch.bool, torch.bool)
         parts = [torch.empty(count, c, *size, dtype=kind, device="cpu") for c, kind in zip(SHAPES, kinds, strict=True)]

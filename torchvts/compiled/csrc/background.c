@@ -9,8 +9,8 @@ static const double PEDESTAL = 0.03, DEFECT_RATIO = 4.0, SATURATED = 0.995, EXAC
 /* The lower median of n values, which are sorted; other: as many more. */
 static float median(float *values, float *other, int n) { return sorted(values, other, n)[(n - 1) / 2]; }
 
-/* noise_std() of core/noise.py, of a plane; some: 2 * pixels floats. */
-static float noise_of(const float *image, int height, int width, float *some) {
+/* noise_std() of core/noise.py, of a plane. */
+float noise_of(const float *image, int height, int width, float *some) {
     const int side = (int)ceil(sqrt((double)height * width / NOISE_SAMPLES)), stride = least(side > 1 ? side : 1, least(height, width));
     int n = 0;
     for (int y = stride / 2; y < height; y += stride)
@@ -18,7 +18,7 @@ static float noise_of(const float *image, int height, int width, float *some) {
             const float *at = image + (size_t)y * width + x;
             some[n] = fabsf(at[1] - 0.5f * (at[0] + at[2]));
         }
-    if (!n) return (float)QUANTISATION_STD;
+    if (!n) return 0.0f;
     const float *ordered = sorted(some, some + n, n);
     float std = 1.5f * (ordered[(n - 1) / 2] / 0.6745f);
     for (int round = 0; round < 2; round++) {
@@ -27,7 +27,7 @@ static float noise_of(const float *image, int height, int width, float *some) {
         for (; k < n && ordered[k] <= 3.0f * std; k++) sum += (double)(ordered[k] * ordered[k]);
         std = (float)sqrt(sum / (k > 1 ? k : 1) / 0.97334);
     }
-    return fmaxf(std / (float)sqrt(1.5), (float)QUANTISATION_STD);
+    return std / (float)sqrt(1.5);
 }
 
 /* Whether the background of a pixel is far from the median around it, where the extremes there do not show that it is no defect. */
@@ -122,10 +122,15 @@ uint8_t *with_background(const Plan *old, const float *image, const char *about,
     float *noise = per_light + 3 * (size_t)pixels, *some = noise + pixels, *skin = some + 3 * (size_t)pixels, *line = skin + 3 * samples;
     uint8_t *bad = (uint8_t *)(line + width);
     double most = 0.0, square = 0.0, std[3];
+    Scratch scratch = {0};
+    const int code = p->marker_diameter > 0.0 ? fill_markers(p, &scratch, image, light) : DONE;
+    free_scratch(&scratch);
+    if (code != DONE) return free(block), refuse(reason, "no memory is left for the background"), NULL;
+    if (p->marker_diameter > 0.0) image = light;
     int lit = 0;
     for (int c = 0; c < 3; c++) {
         const size_t at = (size_t)c * pixels;
-        std[c] = noise_of(image + at, height, width, some);
+        std[c] = fmaxf(noise_of(image + at, height, width, some), (float)QUANTISATION_STD);
         for (int k = 0; k < pixels; k++) {
             light[at + k] = p->exponent == 1.0 ? image[at + k] : (float)pow(image[at + k], p->exponent);
             const float off = (float)light_noise(light[at + k], std[c], p->exponent);

@@ -88,14 +88,16 @@ static int any_weight(const float *weight, size_t n) {
 /* From the image to slopes and weight; conditions: the light (3, 6), what is lost (3), the slope that could not be seen. */
 static int begin(const Plan *plan, Scratch *scratch, const float *image, Frame *frame, float *normal, float *conditions) {
     for (int k = 0; k < 22; k++) conditions[k] = k < 18 && k % 6 == 0;
+    int code = DONE;
+    if (plan->marker_diameter > 0.0) code = fill_markers(plan, scratch, image, normal), image = normal;
     if (plan->light_of) linearise(plan, image, normal), image = normal;
-    const int code = compensate(plan, scratch, image, conditions, frame->light);
+    if (code == DONE) code = compensate(plan, scratch, image, conditions, frame->light);
     if (code != DONE) return code;
     solve_slopes(plan, frame, NULL, normal);
     return weigh(plan, scratch, frame->light, frame->slopes, conditions + 21, frame->weight);
 }
 
-/* A frame. image (3, H, W), as the camera gives it but for its markers; conditions (22), see begin(); depth (1, H, W), gradient (2, H, W), normal
+/* A frame. image (3, H, W), as the camera gives it; conditions (22), see begin(); depth (1, H, W), gradient (2, H, W), normal
    (3, H, W), contact and deformed (1, H, W) bytes. Returns DONE or NO_MEMORY. */
 int reconstruct(const Plan *plan, Scratch *scratch, const float *image, float *conditions, float *depth, float *gradient, float *normal,
                 uint8_t *contact, uint8_t *deformed) {

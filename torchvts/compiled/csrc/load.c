@@ -143,6 +143,8 @@ static int check_rules(const Plan *p, char *reason) {
     } rules[] = {
         {PIXELS <= MOST_PIXELS, "height, width: expected at most 2^26 pixels"},
         {poisson_size((int)p->height) > 0, "height: it has a prime factor above 64, for which there is no fast cosine transform"},
+        {markers_fit(p), "marker_diameter: expected markers smaller than the image"},
+        {p->marker_margin <= 2.0, "marker_margin: expected at most 2 diameters"},
         {p->lights != 1, "lights: expected none, or two or more"},
         {p->blur_taps % 2 || !p->blur_taps, "blur_taps: expected an odd number, or 0"},
         {p->mask_taps % 2 && p->contact_taps % 2, "mask_taps, contact_taps: expected odd numbers"},

@@ -23,6 +23,8 @@ enum { MOST_SIDE = 16384, MOST_PIXELS = 1 << 26, MOST_TAPS = 1025, MOST_WAVES = 
 #define IMAGE_FIELDS(INTEGER, REAL, TABLE, OPTION)                                                                                            \
     /* metric: 1 where lengths are mm, 0 where their scale is not known */                                                                    \
     INTEGER(height, 2, MOST_SIDE) INTEGER(width, 2, MOST_SIDE) REAL(mm_per_pixel, 1e-9) INTEGER(metric, 0, 1)                                 \
+    /* markers.c; diameter in pixels, 0 for a skin without */                                                                                 \
+    REAL(marker_diameter, 0) REAL(marker_contrast, 0) REAL(marker_sigmas, 0) REAL(marker_margin, 0)                                           \
     /* compensate.c; light is value^exponent; light of the values k / (lights - 1), or none; maps (3, height, width); defect (defects), neighbours (.., 4) */          \
     REAL(exponent, 1e-9) INTEGER(lights, 0, 1 << 20) TABLE(float, light_of, p->lights)                                                                             \
     OPTION(float, gain, 3 * PIXELS) OPTION(float, offset, 3 * PIXELS) TABLE(float, pedestal, 3)                                               \
@@ -96,6 +98,7 @@ typedef struct Plan {
 enum { DONE, NO_MEMORY };
 
 /* The stages, each in the file of its name. All images are those of one frame. */
+int fill_markers(const Plan *plan, Scratch *scratch, const float *image, float *filled);                         /* (3, H, W) to the same or another */
 int frame_light(const Plan *plan, Scratch *scratch, const float *image, float *terms);                           /* (3, 6), and lost (3) */
 void linearise(const Plan *plan, const float *image, float *light);                                             /* (3, H, W) to the same */
 int compensate(const Plan *plan, Scratch *scratch, const float *image, float *terms, float *light);              /* (3, H, W) to the same */
@@ -116,7 +119,11 @@ void range(const float *values, size_t n, float *ends);
 size_t poisson_size(int height);
 void make_poisson(int height, int width, double *tables);
 
+/* markers.c: whether the markers of a plan are smaller than its image. */
+int markers_fit(const Plan *plan);
+
 /* Parts that several stages share. */
+float noise_of(const float *image, int height, int width, float *some);                               /* background.c; some: 2 * pixels floats */
 float *sorted(float *values, float *other, int n);                                                    /* compensate.c */
 int blur_plane(Scratch *scratch, const float *plane, const float *weight, int taps, int height, int width, float *out); /* compensate.c */
 void response_normals(const Plan *plan, const float *light, const float *depth, float *normal);       /* response.c */

@@ -126,8 +126,8 @@ def test_calibrate_says_in_few_lines_what_to_expect(rig, run_script, tmp_path):
     given = (tmp_path / "background.png", "--sensor", tmp_path / "rig.yaml", "--out", tmp_path / "unit.safetensors")
     done = run_script("calibrate", *given)
     lines = done.stdout.splitlines()
-    assert done.returncode == 0 and done.stderr == "" and len(lines) == 4, done.stderr
-    assert [line.partition(" ")[0] for line in lines] == ["sensor:", "chosen:", "expected:", "wrote"]
+    assert done.returncode == 0 and done.stderr == "" and len(lines) == 5, done.stderr
+    assert [line.partition(" ")[0] for line in lines] == ["sensor:", "chosen:", "expected:", "wrote", "next:"]
     assert "directions of the lights to 0." in lines[2]
     wrong = run_script("calibrate", *given, "--press", tmp_path / "ball.png", "20", "--press", tmp_path / "background.png", "20")
     left = [line for line in wrong.stdout.splitlines() if line.startswith("left out: press background.png: ")]

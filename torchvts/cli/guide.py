@@ -122,6 +122,8 @@ class Watch:
 
     def why_not_at_rest(self) -> str:
         """Why the frames are not those of still, untouched skin; "" where they are."""
+        if len(self._rectified) < FIRST_FRAMES:
+            return f"keep the sensor still, and off everything, for {FIRST_FRAMES} frames"
         if self.moves():
             return "something moves, or the light changes: keep the sensor still, and off everything"
         try:

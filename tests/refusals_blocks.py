@@ -102,9 +102,9 @@ TABLE = {
     "FillMarkers": Entry({"diameter_px": 9.0, "contrast": 0.06, "sigmas": 5.0, "margin": 0.2},
         {"diameter_px": ["9", None, NAN, -1], "contrast": NUMBER, "sigmas": NUMBER, "margin": NUMBER}),
     "FillMarkers.from_background": Entry(
-        {"background": torch.full((3, 64, 64), 0.5), "contrast": 0.06, "least_markers": 8, "margin": 0.2}, {
+        {"background": torch.full((3, 64, 64), 0.5), "margin": 0.2}, {
         "background": [b for b in images(64, 64) if not (isinstance(b, torch.Tensor) and tuple(b.shape) == (3, 63, 64))],
-        "contrast": NUMBER, "least_markers": INTEGER, "margin": NUMBER}),
+        "margin": NUMBER}),
     "FillMarkers.from_dict": Entry({"values": FillMarkers().to_dict(), "source": "file"},
         {"values": [None, [], {"unknown": 1.0}, {"contrast": -1}]}, label=("source",), named={"values": "file"},
         file=("values",)),

@@ -186,10 +186,7 @@ class FillMarkers(nn.Module):
     With ``diameter_px`` 0, which :meth:`from_background` sets for a skin without markers, images are unchanged.
 
     Args:
-        diameter_px: as for :func:`find_markers`, or 0.
-        contrast: as for :func:`find_markers`.
-        sigmas: as for :func:`find_markers`.
-        margin: as for :func:`find_markers`.
+        diameter_px, contrast, sigmas, margin: as for :func:`find_markers`.
 
     Example:
         >>> image = torch.full((1, 3, 64, 64), 0.5); image[..., 20:26, 30:36] = 0.2
@@ -205,18 +202,14 @@ class FillMarkers(nn.Module):
         self.margin = check_positive("margin", margin, 2.0)
 
     @classmethod
-    def from_background(
-        cls, background: Tensor, contrast: float = 0.06, least_markers: int = FEWEST_DOTS, margin: float = 0.2
-    ) -> "FillMarkers":
+    def from_background(cls, background: Tensor, margin: float = 0.2) -> "FillMarkers":
         """Make the block for a unit.
 
         The reach at which most is found dark shows the markers completely; the 90th percentile of their longer sides there is the
-        diameter. The contrast is a fifth of the 5th percentile of their depths, and at least ``contrast``.
+        diameter. The contrast is a fifth of the 5th percentile of their depths. Fewer than :data:`FEWEST_DOTS` are dust.
 
         Args:
             background: (3, H, W) in [0, 1], image without contact.
-            contrast: least depth of a marker, as the logarithm of value.
-            least_markers: fewer are taken for dust, and nothing is filled.
             margin: as for :func:`find_markers`.
         Example:
             >>> FillMarkers.from_background(torch.full((3, 64, 64), 0.5)).diameter_px
@@ -224,12 +217,11 @@ class FillMarkers(nn.Module):
         """
         check_field("background", background)
         check_range("background", background)
-        check_positive("contrast", contrast), check_integer("least_markers", least_markers, 1)
-        none = cls(0.0, contrast, margin=margin)
+        none = cls(0.0, margin=margin)
         light, diameter, best = _log_light(background[None], 1), 0.0, 0.0
         reach = 3.0
         while reach < min(background.shape[1:]) / 8.0:
-            depth, _, least = _marker_depth(light, reach, contrast, none.sigmas)
+            depth, _, least = _marker_depth(light, reach, none.contrast, none.sigmas)
             found = float(torch.where(depth > least, depth, 0.0).sum())
             if found > 1.1 * best:  # a longer reach must find clearly more, because it includes neighbours
                 diameter, best = reach, found
@@ -237,13 +229,13 @@ class FillMarkers(nn.Module):
         if diameter == 0.0:
             return none
         for _ in range(2):  # the reach is the diameter, so repeat with the measured one
-            strict, mean, least = _marker_depth(light, diameter, contrast, none.sigmas)
+            strict, mean, least = _marker_depth(light, diameter, none.contrast, none.sigmas)
             peak = _square_max(torch.where(strict > least, mean, 0.0), max(1, math.ceil(0.5 * diameter)))
             _, _, side, largest = _blobs((peak > 0) & (mean > 0.5 * peak), mean)
-            if len(side) < least_markers:
+            if len(side) < FEWEST_DOTS:
                 return none
             diameter = float(side.quantile(0.9))
-        return cls(diameter, max(contrast, float(largest.quantile(0.05)) / 5.0), margin=margin)
+        return cls(diameter, max(none.contrast, float(largest.quantile(0.05)) / 5.0), margin=margin)
 
     def forward(self, image: Tensor) -> Tensor:
         """(B, 3, H, W) to (B, 3, H, W)."""

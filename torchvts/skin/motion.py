@@ -128,22 +128,12 @@ class SkinMotion(nn.Module):
         self.nearest_mm, self.pedestal, self.depth_share, self.depth_mm = NEAREST_CAMERA_MM, PEDESTAL, DEPTH_SHARE, DEPTH_MM
         self.nugget, self.bend_share, self.floor_px = NUGGET, BEND_SHARE, FLOOR_PX
         middle = 0.5 * dots.new_tensor([self.width - 1.0, self.height - 1.0])
-        for name, value in (
-            ("middle_px", middle),
-            ("rest_px", dots),
-            ("rest_mm", (dots - middle) * self.mm_per_pixel),
-            ("camera", torch.tensor([x, y, 1.0 / height], dtype=torch.float64)),
-            ("beside", distance < REACH * self.spacing_px),
-        ):
-            self.register_buffer(name, value if value.dtype == torch.bool else value.to(background.dtype))
+        self.register_buffer("beside", distance < REACH * self.spacing_px)
         grey = self.log_light(background[None])
         half = min(PATCH * self.diameter_px, 0.5 * self.spacing_px)
-        self.rim_px = 0.8 * half
-        blur_px = max(self.diameter_px / 3.0, self.spacing_px / 5.0)
-        cell = max(1, int(blur_px / 2.0))
-        self.coarse = DotTemplates(grey, dots, COARSE_PATCH * self.spacing_px, cell, blur_px)
+        self.rim_px, blur_px = 0.8 * half, max(self.diameter_px / 3.0, self.spacing_px / 5.0)
+        self.coarse = DotTemplates(grey, dots, COARSE_PATCH * self.spacing_px, max(1, int(blur_px / 2.0)), blur_px)
         self.fine = DotTemplates(grey, dots, half, max(1, int(self.diameter_px / 10.0)), 0.1 * self.diameter_px)
-        self.register_buffer("terms", torch.cat((self.fine.patch, quadratic(self.fine.patch)), dim=-1))
         # the process: how alike dots move, derivatives of this, and what bends do to places
         length = LENGTH * self.spacing_px
         far = (dots[:, None] - dots).double() / length
@@ -154,6 +144,11 @@ class SkinMotion(nn.Module):
         prior = torch.tensor([[3, 0, 1], [0, 1, 0], [1, 0, 3]], dtype=torch.float64) * (25.0 / 3.0 / length**4)  # of bends
         by_bend = self.fine.by_bend.double()
         for name, value in (
+            ("middle_px", middle),
+            ("rest_px", dots),
+            ("rest_mm", (dots - middle) * self.mm_per_pixel),
+            ("camera", torch.tensor([x, y, 1.0 / height], dtype=torch.float64)),
+            ("terms", torch.cat((self.fine.patch, quadratic(self.fine.patch)), dim=-1)),
             ("alike", matern(far.norm(dim=-1))),
             ("slopes", slopes.mT),
             ("by_bend", torch.einsum("nkjq,nmq->nkjm", by_bend, slopes[..., 2:]).flatten(1, 2)),

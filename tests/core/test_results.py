@@ -190,10 +190,6 @@ def test_what_is_no_result_is_refused(results, tmp_path):
         (tmp_path / "bad.npz").write_bytes(content)
         with pytest.raises(ValueError, match=r"bad\.npz: "):
             vts.read_result(tmp_path / "bad.npz")
-    with zipfile.ZipFile(tmp_path / "bomb.npz", "w", zipfile.ZIP_BZIP2) as archive:
-        archive.writestr("depth_mm.npy", bytes(2**24))
-    with pytest.raises(ValueError, match=r"damaged: its \d+ bytes cannot hold the 16777216 that it claims"):
-        vts.read_result(tmp_path / "bomb.npz")
     for path, error, message in (
         (tmp_path / "none.npz", FileNotFoundError, "no such result file"),
         (results, FileNotFoundError, r"name one of its \.npz files"),

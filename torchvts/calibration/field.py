@@ -18,10 +18,10 @@ from torch import Tensor
 from ..model.response_field import (
     CHANGE_SCALE,
     ResponseField,
-    monomials,
+    Terms,
+    powers,
     sine_from_slope,
     slope_from_sine,
-    term_degrees_by_term,
     term_values,
 )
 from .contacts import Contact
@@ -43,8 +43,8 @@ LEAST_POWER = 1e-3
 
 
 @dataclass(frozen=True)
-class Family:
-    """The size of a field.
+class Family(Terms):
+    """The size of a field: K coefficients of each slope.
 
     Attributes:
         degree: of linear terms in position.
@@ -58,10 +58,6 @@ class Family:
     half_mm: float
     cubic_degree: int = -1
 
-    def degrees(self) -> dict[tuple[int, ...], int]:
-        """Degree in position of every term, in order."""
-        return term_degrees_by_term(self.degree, self.product_degree, self.cubic_degree)
-
     def penalty(self, power: float = 1.0) -> Tensor:
         """(K,): how much less likely than a constant linear term each coefficient is, as a precision.
 
@@ -70,16 +66,9 @@ class Family:
                 unit of faint changes is regularised more strongly than one of strong changes.
         """
         factors = [
-            ORDER_PENALTY[len(term) - 1] * DEGREE_PENALTY ** (i + j) * power ** len(term)
-            for term, d in self.degrees().items()
-            for i in range(d + 1)
-            for j in range(d + 1 - i)
+            ORDER_PENALTY[len(term) - 1] * DEGREE_PENALTY ** (i + j) * power ** len(term) for term, i, j in powers(self.degrees())
         ]
         return torch.tensor(factors, dtype=torch.float64)
-
-    def size(self) -> int:
-        """Number K of coefficients of one slope."""
-        return sum(map(monomials, self.degrees().values()))
 
     def field(self, coefficient: Tensor) -> ResponseField:
         """The field of coefficients (2, K)."""

@@ -20,7 +20,7 @@ from ..skin import ContactFromDepth, ContactMask, ZeroBackground
 from ..skin import pressure as pressure_module
 from ..skin import weight as weight_module
 from ..skin import zero as zero_module
-from .plan import Values
+from .plan import Values, fields
 
 LIGHTS = 8193
 """Values of a camera whose light stands in a table: between them light^2.2 is a line to 5e-9."""
@@ -178,8 +178,8 @@ def normals_values(name: str, model: nn.Module, gradient: nn.Module) -> Values:
     check_block(name, model, NormalFromIntensity, NormalFromResponse)
     check_block("solve.gradient", gradient, GradientFromNormal)
     assert isinstance(gradient, GradientFromNormal)
-    names = [field for kind in (_LIGHTS, _RESPONSE) for field in kind]
-    values: Values = dict.fromkeys(names) | {field: 0 for field in names if field in _NUMBERS}
+    # of the other model: no tables, and numbers that nothing reads
+    values: Values = {field: 0 if fields()[field][0] in ("i", "d") else None for field in _LIGHTS + _RESPONSE}
     values["max_slope"] = gradient.max_slope
     if isinstance(model, NormalFromIntensity):
         return values | _lights_values(name, model)
@@ -193,11 +193,6 @@ _LIGHTS = (
     "shadow_steps", "cliff_slope", "start_slope", "left_out", "failed_share",
 )  # fmt: skip
 _RESPONSE = ("field_place", "field", "degree", "terms", "per_mm", "steeper", "reference_mm", "max_sine")
-_NUMBERS = {
-    "by_lights", "any_ill_conditioned", "per_camera_height", "prior_std", "brightness_noises",
-    "least_brightness", "shadow_steps", "cliff_slope", "start_slope", "left_out", "failed_share", "degree", "terms", "steeper",
-    "reference_mm", "max_sine",
-}  # fmt: skip
 
 
 def _lights_values(name: str, model: NormalFromIntensity) -> Values:

@@ -351,11 +351,20 @@ _NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 
 def check_positive(name: str, value: object, most: float = math.inf) -> float:
     """Return ``value`` as a float, or raise if it is no finite number in (0, ``most``]."""
+    return _check_number(name, value, LEAST_NUMBER, most, f"in (0, {most:g}]" if math.isfinite(most) else "above 0 and finite")
+
+
+def check_least(name: str, value: object, least: float = 0.0, most: float = math.inf) -> float:
+    """Return ``value`` as a float, or raise if it is no finite number in [``least``, ``most``]."""
+    bound = f"of at least {least:g}" if math.isfinite(least) else "that is finite"
+    return _check_number(name, value, least, most, f"in [{least:g}, {most:g}]" if math.isfinite(most) else bound)
+
+
+def _check_number(name: str, value: object, least: float, most: float, bound: str) -> float:
     if isinstance(value, bool) or not isinstance(value, numbers.Real):
         raise TypeError(f"{name}: expected a number, got {_kind_and_comma(value)}")
     number = _float(value)
-    if not math.isfinite(number) or number <= 0 or number > most:
-        bound = f"in (0, {most:g}]" if math.isfinite(most) else "above 0 and finite"
+    if not math.isfinite(number) or not least <= number <= most:
         raise ValueError(f"{name}: expected a number {bound}, got {brief(value)}")
     return number
 
@@ -387,19 +396,6 @@ def _float(value: numbers.Real) -> float:
     if abs(number) > MOST_NUMBER or (isinstance(value, numbers.Integral) and abs(number) >= 2.0**63):
         return math.copysign(math.inf, number)
     return 0.0 if abs(number) < LEAST_NUMBER else number  # NaN stays NaN
-
-
-def check_least(name: str, value: object, least: float = 0.0, most: float = math.inf) -> float:
-    """Return ``value`` as a float, or raise if it is no finite number in [``least``, ``most``]."""
-    if isinstance(value, bool) or not isinstance(value, numbers.Real):
-        raise TypeError(f"{name}: expected a number, got {_kind_and_comma(value)}")
-    number = _float(value)
-    if not math.isfinite(number) or not least <= number <= most:
-        bound = f"of at least {least:g}" if math.isfinite(least) else "that is finite"
-        if math.isfinite(most):
-            bound = f"in [{least:g}, {most:g}]"
-        raise ValueError(f"{name}: expected a number {bound}, got {brief(value)}")
-    return number
 
 
 def check_integer(name: str, value: object, least: int, most: int = MOST_COUNT) -> int:

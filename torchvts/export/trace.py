@@ -9,7 +9,8 @@ from torch import Tensor, nn
 from ..compensate import Rectify
 from ..core.checks import check_batch, check_dtype, check_same_size, check_size, check_switch
 from ..integration import Integrator, PoissonDCT, divergence
-from ..integration.transforms import cosine_bases, fold, unfold
+from ..integration.poisson import zeroed_in_background
+from ..integration.transforms import cosine_basis, matrices, solve_by_matrices
 from ..pipeline import DepthOutput, DepthPipeline, Shadows
 
 MAX_BATCH = 1024
@@ -44,37 +45,17 @@ class PoissonBackgroundByMatrix(Integrator):
         self.size = (height, width)
         self.mm_per_pixel = mm_per_pixel
         self.zero_in_background = zero_in_background
-        even_y, odd_y, value_even_y, value_odd_y = cosine_bases(height)
-        even_x, odd_x, value_even_x, value_odd_x = cosine_bases(width)
-        for name, basis in (("even_y", even_y), ("odd_y", odd_y), ("even_x", even_x), ("odd_x", odd_x)):
-            self.register_buffer(name, basis.to(dtype))
-        for y, value_y in (("even", value_even_y), ("odd", value_odd_y)):
-            for x, value_x in (("even", value_even_x), ("odd", value_odd_x)):
-                value = value_y[:, None] + value_x[None, :]
-                inverse = torch.where(value == 0.0, torch.zeros_like(value), 1.0 / value)  # zero: the mean
-                self.register_buffer(f"inverse_{y}_{x}", inverse.to(dtype))
+        for name, table in zip(("basis_y", "basis_x", "inverse"), matrices(cosine_basis(height), cosine_basis(width))):
+            self.register_buffer(name, table.to(dtype))
 
     def forward(self, gradient: Tensor) -> Tensor:
         check_batch("gradient", gradient, 2)
         check_same_size("gradient", gradient, "the matrices", self.size[0], self.size[1])
-        if gradient.dtype != self.get_buffer("even_y").dtype:
-            raise TypeError(f"gradient: expected {self.get_buffer('even_y').dtype} like the matrices, got {gradient.dtype}")
-        up, down = fold(divergence(gradient), -2)
-        rows = []
-        for y, part in (("even", up), ("odd", down)):
-            basis_y = self.get_buffer(f"{y}_y")
-            lines = []
-            for x, block in zip(("even", "odd"), fold(part, -1)):
-                basis_x, inverse = self.get_buffer(f"{x}_x"), self.get_buffer(f"inverse_{y}_{x}")
-                lines.append(basis_y.t() @ ((basis_y @ block @ basis_x.t()) * inverse) @ basis_x)
-            rows.append(unfold(lines[0], lines[1], -1))
-        depth = self.mm_per_pixel * unfold(rows[0], rows[1], -2)
-        if not self.zero_in_background:
-            return depth
-        background = ((gradient[:, 0:1] == 0) & (gradient[:, 1:2] == 0)).to(depth.dtype)
-        count = background.sum(dim=(2, 3), keepdim=True)
-        mean = (depth * background).sum(dim=(2, 3), keepdim=True) / count.clamp_min(1.0)
-        return depth - torch.where(count > 0, mean, depth.amin(dim=(2, 3), keepdim=True))
+        plan = [self.get_buffer(name) for name in ("basis_y", "basis_x", "inverse")]
+        if gradient.dtype != plan[0].dtype:
+            raise TypeError(f"gradient: expected {plan[0].dtype} like the matrices, got {gradient.dtype}")
+        depth = self.mm_per_pixel * solve_by_matrices(divergence(gradient), plan)
+        return zeroed_in_background(depth, gradient) if self.zero_in_background else depth
 
 
 class FromRaw(nn.Module):

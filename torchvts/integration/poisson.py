@@ -14,15 +14,7 @@ from ..core.checks import check_batch, check_positive, has_memory
 from ..core.precision import widened
 from .base import Integrator
 from .screened import check_known, solve_screened
-from .transforms import (
-    cosine_tables,
-    fold,
-    inverse_or_zero,
-    reordering,
-    sine_bases,
-    solve_by_fft,
-    unfold,
-)
+from .transforms import cosine_tables, matrices, reordering, sine_basis, solve_by_fft, solve_by_matrices
 
 
 def divergence(gradient: Tensor) -> Tensor:
@@ -66,7 +58,7 @@ def poisson_dst(gradient: Tensor, mm_per_pixel: float = 1.0) -> Tensor:
     check_gradient(gradient, 3)
     if not torch.jit.is_scripting():
         mm_per_pixel = check_positive("mm_per_pixel", mm_per_pixel)
-    return _integrate_dst(gradient, mm_per_pixel, _plan_dst(_wide(gradient)))
+    return _integrate_dst(gradient, mm_per_pixel, _plan_dst(_wide(gradient), gradient.shape[2], gradient.shape[3]))
 
 
 def poisson_dct(gradient: Tensor, mm_per_pixel: float = 1.0) -> Tensor:
@@ -125,13 +117,13 @@ class PoissonDST(Integrator):
     def __init__(self, mm_per_pixel: float = 1.0) -> None:
         super().__init__()
         self.mm_per_pixel = check_positive("mm_per_pixel", mm_per_pixel)
-        self._plan: list[Tensor] = _plan_dst(torch.zeros(1, 2, 3, 3, dtype=torch.float64))
+        self._plan: list[Tensor] = _plan_dst(torch.zeros(1, dtype=torch.float64), 3, 3)
 
     def forward(self, gradient: Tensor) -> Tensor:
         check_gradient(gradient, 3)
         plan = self._plan
         if not _plan_fits(plan, _wide(gradient), gradient.shape[2], gradient.shape[3]):
-            plan = _kept(_plan_dst(_wide(gradient)))
+            plan = _kept(_plan_dst(_wide(gradient), gradient.shape[2], gradient.shape[3]))
             if _plain(plan[2]):
                 self._plan = plan
         return _integrate_dst(gradient, self.mm_per_pixel, plan)
@@ -202,7 +194,7 @@ class PoissonBackground(PoissonDCT):
         self.zero_in_background = True
 
 
-def _zero_in_background(depth: Tensor, gradient: Tensor) -> Tensor:
+def zeroed_in_background(depth: Tensor, gradient: Tensor) -> Tensor:
     """Zero on average where the gradient is, or where that is nowhere, its lowest. The depth has zero mean."""
     inclined = ((gradient[:, 0:1] != 0) | (gradient[:, 1:2] != 0)).to(depth.dtype)
     pixels = float(depth.shape[2] * depth.shape[3])
@@ -222,7 +214,7 @@ def check_gradient(gradient: Tensor, least: int) -> None:
 
 
 def _integrate_dst(gradient: Tensor, mm_per_pixel: float, plan: list[Tensor]) -> Tensor:
-    z = _solve(divergence(widened(gradient))[..., 1:-1, 1:-1], plan)
+    z = solve_by_matrices(divergence(widened(gradient))[..., 1:-1, 1:-1], plan)
     return (mm_per_pixel * nn.functional.pad(z, [1, 1, 1, 1])).to(gradient.dtype)
 
 
@@ -232,7 +224,7 @@ def _integrate_dct(gradient: Tensor, mm_per_pixel: float, plan: list[Tensor], ze
         return gradient[:, 0:1]  # a transform of nothing is an error
     depth = solve_by_fft(mm_per_pixel * divergence(widened(gradient)), plan)
     if zero_in_background:
-        depth = _zero_in_background(depth, gradient)
+        depth = zeroed_in_background(depth, gradient)
     return depth.to(gradient.dtype)
 
 
@@ -258,10 +250,9 @@ def _plain(table: Tensor) -> bool:
         return torch.compiler.is_compiling() or has_memory(table)
 
 
-def _plan_dst(gradient: Tensor) -> list[Tensor]:
-    even_y, odd_y, value_even_y, value_odd_y = sine_bases(gradient.shape[2] - 2)
-    even_x, odd_x, value_even_x, value_odd_x = sine_bases(gradient.shape[3] - 2)
-    return _plan([even_y, odd_y], [value_even_y, value_odd_y], [even_x, odd_x], [value_even_x, value_odd_x], gradient)
+def _plan_dst(like: Tensor, height: int, width: int) -> list[Tensor]:
+    """The three tables of :func:`solve_by_matrices` for the inside of an image, of the dtype and on the device of ``like``."""
+    return [table.to(like.dtype).to(like.device) for table in matrices(sine_basis(height - 2), sine_basis(width - 2))]
 
 
 def plan_dct(like: Tensor, height: int, width: int) -> list[Tensor]:
@@ -273,34 +264,9 @@ def plan_dct(like: Tensor, height: int, width: int) -> list[Tensor]:
     return [table.to(like.device) for table in tables] + order
 
 
-def _plan(
-    basis_y: list[Tensor], value_y: list[Tensor], basis_x: list[Tensor], value_x: list[Tensor], gradient: Tensor
-) -> list[Tensor]:
-    """Twelve tensors: for each of the four parities the basis along y, the basis along x, the inverse eigenvalues."""
-    plan: list[Tensor] = []
-    for i in range(2):
-        for j in range(2):
-            value = value_y[i][:, None] + value_x[j][None, :]
-            for tensor in (basis_y[i], basis_x[j], inverse_or_zero(value)):
-                plan.append(tensor.to(gradient.dtype).to(gradient.device))
-    return plan
-
-
 def _plan_fits(plan: list[Tensor], like: Tensor, height: int, width: int) -> bool:
     table = plan[2]  # real: inverse eigenvalues
     same_kind = table.dtype == like.dtype and table.device == like.device and _plain(table) and _plain(like)
-    if len(plan) == 12:
-        return same_kind and plan[0].shape[0] + plan[6].shape[0] == height - 2 and plan[1].shape[0] + plan[4].shape[0] == width - 2
+    if len(plan) == 3:
+        return same_kind and plan[0].shape[0] == height - 2 and plan[1].shape[0] == width - 2
     return same_kind and plan[-2].shape[0] == height and plan[-1].shape[0] == width
-
-
-def _solve(right: Tensor, plan: list[Tensor]) -> Tensor:
-    """Depth of unit pitch whose Laplacian is ``right``, zero on the border: each parity is transformed and divided by itself."""
-    up, down = fold(right, -2)
-    up_even, up_odd = fold(up, -1)
-    down_even, down_odd = fold(down, -1)
-    blocks = [up_even, up_odd, down_even, down_odd]
-    for i in range(4):
-        basis_y, basis_x, inverse = plan[3 * i], plan[3 * i + 1], plan[3 * i + 2]
-        blocks[i] = basis_y.t() @ ((basis_y @ blocks[i] @ basis_x.t()) * inverse) @ basis_x
-    return unfold(unfold(blocks[0], blocks[1], -1), unfold(blocks[2], blocks[3], -1), -2)

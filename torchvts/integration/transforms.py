@@ -1,8 +1,6 @@
-r"""Sine and cosine transforms: small matrix products split by parity, and the cosine transform by one real FFT.
+r"""Sine and cosine transforms: by matrix products, and the cosine transform by one real FFT.
 
-Matrices: both bases have rows that are even or odd about the middle of the line. A line's even part meets only the even rows, its
-odd part only the odd ones, so folding the line first halves the multiplications. The coefficients stay in two blocks: a
-solver that only scales them never needs them interleaved. Rows are orthonormal, so the inverse is the transpose.
+The rows of both bases are orthonormal, so the inverse is the transpose.
 """
 
 import math
@@ -11,56 +9,38 @@ import torch
 from torch import Tensor
 
 
-def sine_bases(length: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Even and odd half of the DST-I basis, and the second difference's eigenvalues that go with them.
+def sine_basis(length: int) -> tuple[Tensor, Tensor]:
+    """The DST-I basis (n, n), a wave a row, and the second difference's eigenvalues (n,), all negative; float64.
 
-    Returns:
-        even (ceil(n/2), ceil(n/2)), odd (floor(n/2), floor(n/2)), their eigenvalues, all negative; float64.
     Source:
         Simchony, Chellappa, Shao, TPAMI 12(5), 1990: 2 cos(pi k / (n + 1)) - 2 for k = 1 ... n.
     """
     k = torch.arange(1, length + 1, dtype=torch.float64)
-    j = torch.arange(1, (length + 1) // 2 + 1, dtype=torch.float64)
-    basis = math.sqrt(2.0 / (length + 1)) * torch.sin(math.pi / (length + 1) * k[:, None] * j[None, :])
-    return _split(basis, -4.0 * torch.sin(math.pi / (2 * (length + 1)) * k).square(), length)
+    basis = math.sqrt(2.0 / (length + 1)) * torch.sin(math.pi / (length + 1) * k[:, None] * k[None, :])
+    return basis, -4.0 * torch.sin(math.pi / (2 * (length + 1)) * k).square()
 
 
-def cosine_bases(length: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def cosine_basis(length: int) -> tuple[Tensor, Tensor]:
     """The same for the DCT-II basis; the eigenvalue of the constant is zero.
 
     Source:
         Strang, The discrete cosine transform, SIAM Review 41(1), 1999: 2 cos(pi k / n) - 2 for k = 0 ... n - 1.
     """
     k = torch.arange(length, dtype=torch.float64)
-    j = torch.arange((length + 1) // 2, dtype=torch.float64)
-    basis = math.sqrt(2.0 / length) * torch.cos(math.pi / length * k[:, None] * (j[None, :] + 0.5))
+    basis = math.sqrt(2.0 / length) * torch.cos(math.pi / length * k[:, None] * (k[None, :] + 0.5))
     basis[0] *= math.sqrt(0.5)
-    return _split(basis, -4.0 * torch.sin(math.pi / (2 * length) * k).square(), length)
+    return basis, -4.0 * torch.sin(math.pi / (2 * length) * k).square()
 
 
-def _split(basis: Tensor, eigenvalues: Tensor, length: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    # row 0 is even, row 1 odd, row 2 even ...; an odd row vanishes in the middle of a line of odd length
-    return basis[0::2].contiguous(), basis[1::2, : length // 2].contiguous(), eigenvalues[0::2], eigenvalues[1::2]
+def matrices(y: tuple[Tensor, Tensor], x: tuple[Tensor, Tensor]) -> list[Tensor]:
+    """Tables of :func:`solve_by_matrices` from the bases along y and x: both bases, and the Laplacian's inverse eigenvalues."""
+    return [y[0], x[0], inverse_or_zero(y[1][:, None] + x[1][None, :])]
 
 
-def fold(lines: Tensor, dim: int) -> tuple[Tensor, Tensor]:
-    """Even part (ceil(n/2)) and odd part (floor(n/2)) of lines along ``dim``; the middle one counts once."""
-    n = lines.shape[dim]
-    half = n // 2
-    first = lines.narrow(dim, 0, half)
-    last = lines.narrow(dim, n - half, half).flip(dim)
-    even = first + last
-    if n % 2 == 1:
-        even = torch.cat((even, lines.narrow(dim, half, 1)), dim=dim)
-    return even, first - last
-
-
-def unfold(even: Tensor, odd: Tensor, dim: int) -> Tensor:
-    """Lines from the values that their even and odd coefficients give on the first half."""
-    half = odd.shape[dim]
-    paired = even.narrow(dim, 0, half)
-    middle = even.narrow(dim, half, even.shape[dim] - half)  # empty where the length is even
-    return torch.cat((paired + odd, middle, (paired - odd).flip(dim)), dim=dim)
+def solve_by_matrices(right: Tensor, plan: list[Tensor]) -> Tensor:
+    """Depth of unit pitch whose five-point Laplacian is ``right``, at the border as the bases are."""
+    basis_y, basis_x, inverse = plan[0], plan[1], plan[2]
+    return basis_y.t() @ ((basis_y @ right @ basis_x.t()) * inverse) @ basis_x
 
 
 def cosine_tables(height: int, width: int) -> list[Tensor]:

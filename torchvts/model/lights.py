@@ -198,11 +198,7 @@ def seen_at(undeformed_mm: Tensor, depth_mm: Tensor, camera_height_mm: float) ->
 
 
 def light_matrix(
-    depth_mm: Tensor,
-    position_mm: Tensor,
-    albedo: Tensor,
-    mm_per_pixel: float,
-    camera_height_mm: float = math.inf,
+    depth_mm: Tensor, position_mm: Tensor, albedo: Tensor, mm_per_pixel: float, camera_height_mm: float = math.inf
 ) -> Tensor:
     """The matrix L of ``I = L n``: row j is rho^j (S^j - P) / |S^j - P|^3.
 
@@ -298,11 +294,7 @@ def glossy_light(rows: Tensor, normal: Tensor, gloss: Tensor, roughness: float =
 
 
 def inverse_light_matrix(
-    depth_mm: Tensor,
-    position_mm: Tensor,
-    albedo: Tensor,
-    mm_per_pixel: float,
-    camera_height_mm: float = math.inf,
+    depth_mm: Tensor, position_mm: Tensor, albedo: Tensor, mm_per_pixel: float, camera_height_mm: float = math.inf
 ) -> Tensor:
     r"""Inverse of the light matrix at every pixel, in closed form.
 
@@ -310,11 +302,7 @@ def inverse_light_matrix(
     (a_k x a_l) |a_j|^3 / (rho^j det[a_1 a_2 a_3]), j, k, l cyclic, and a_k x a_l = S^k x S^l - P x (S^l - S^k) is linear in P.
 
     Args:
-        depth_mm: (B, 1, H, W), mm.
-        position_mm: (3, 3), mm.
-        albedo: (3,).
-        mm_per_pixel: pixel pitch, mm.
-        camera_height_mm: as for :func:`light_matrix`.
+        depth_mm, position_mm, albedo, mm_per_pixel, camera_height_mm: as for :func:`light_matrix`.
     Returns:
         (B, 3, 3, H, W): normal axis, light, row, column.
     Source:
@@ -357,11 +345,7 @@ def normal_at_depth(
 
     Args:
         image: (B, 3, H, W), linear light.
-        depth_mm: (B, 1, H, W), mm.
-        position_mm: as for :func:`inverse_light_matrix`.
-        albedo: as for :func:`inverse_light_matrix`.
-        mm_per_pixel: pixel pitch, mm.
-        camera_height_mm: as for :func:`light_matrix`.
+        depth_mm, position_mm, albedo, mm_per_pixel, camera_height_mm: as for :func:`light_matrix`.
     Returns:
         (B, 3, H, W); zero where the image is zero.
     Source:

@@ -4,13 +4,15 @@ import dataclasses
 import math
 from dataclasses import dataclass
 from itertools import combinations_with_replacement
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
 
 from ..core.checks import brief, check_integer, check_least, check_numbers, check_positive, from_dict
 from ..core.geometry import pixel_grid_mm
+
+_Kind = TypeVar("_Kind", bound="_Coefficients")
 
 CHANGE_SCALE = 0.3
 """Relative change of intensity that counts as one, so that the inputs are of order one."""
@@ -24,8 +26,52 @@ PRIOR_VERSION = 2
 """Version of a prior in a sensor file. One of another version is refused."""
 
 
+class Terms:
+    """The terms of a field, by the degrees in position of its linear terms and of its products of two and of three."""
+
+    degree: int
+    product_degree: int
+    cubic_degree: int
+
+    def degrees(self) -> dict[tuple[int, ...], int]:
+        """Degree in position of every term, in order."""
+        return term_degrees_by_term(self.degree, self.product_degree, self.cubic_degree)
+
+    def size(self) -> int:
+        """Number of coefficients of one slope."""
+        return sum(map(monomials, self.degrees().values()))
+
+
+class _Coefficients:
+    """Coefficients of :func:`position_basis`, which files hold as plain numbers."""
+
+    half_mm: float
+    coefficient: tuple[tuple[float, ...], ...]
+
+    def _keep(self, rows: int, size: int) -> None:
+        """Check and keep the numbers that every subclass has."""
+        object.__setattr__(self, "half_mm", check_positive("half_mm", self.half_mm))
+        numbers = check_numbers("coefficient", self.coefficient, (rows, size))
+        object.__setattr__(self, "coefficient", tuple(numbers[k * size : (k + 1) * size] for k in range(rows)))
+
+    def tensor(self) -> Tensor:
+        """The coefficients, (rows, size) float64."""
+        return torch.tensor(self.coefficient, dtype=torch.float64)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain numbers, to seven digits, which is more than presses determine."""
+        rows = [[float(f"{number:.7g}") for number in row] for row in self.coefficient]
+        values: dict[str, Any] = dataclasses.asdict(self)  # type: ignore[call-overload]
+        return values | {"coefficient": rows}
+
+    @classmethod
+    def from_dict(cls: type[_Kind], values: Any, source: str) -> _Kind:
+        """Read the output of :meth:`to_dict`; ``source`` names it in errors."""
+        return from_dict(cls, values, source)
+
+
 @dataclass(frozen=True)
-class ResponseField:
+class ResponseField(Terms, _Coefficients):
     r"""sine(x, y) = sum over terms of W_t(x, y) * term_t(change).
 
     The sine is ``slope / sqrt(1 + |slope|^2)``, the part of the unit normal that lies in the plane of the undeformed skin: the
@@ -59,34 +105,18 @@ class ResponseField:
         for name, least in (("degree", 0), ("product_degree", -1), ("cubic_degree", -1)):
             if check_integer(name, getattr(self, name), least) > 6:
                 raise ValueError(f"{name}: expected at most 6, got {getattr(self, name)}")
-        object.__setattr__(self, "half_mm", check_positive("half_mm", self.half_mm))
-        numbers = check_numbers("coefficient", self.coefficient, (2, self.size()))
-        object.__setattr__(self, "coefficient", (numbers[: self.size()], numbers[self.size() :]))
+        self._keep(2, self.size())
 
     def terms(self) -> list[tuple[int, ...]]:
         """Terms as indices of their inputs: (0,) is the change of R, (0, 2) that change times the change of B."""
         return list(self.degrees())
 
-    def degrees(self) -> dict[tuple[int, ...], int]:
-        """Degree in position of every term, in order."""
-        return term_degrees_by_term(self.degree, self.product_degree, self.cubic_degree)
-
-    def size(self) -> int:
-        """Number of coefficients of one slope."""
-        return sum(map(monomials, self.degrees().values()))
-
-    def tensor(self) -> Tensor:
-        """(2, size) float64."""
-        return torch.tensor(self.coefficient, dtype=torch.float64)
-
     def maps(self, height: int, width: int, mm_per_pixel: float) -> Tensor:
         """W at every pixel: (terms, 2, H, W) float64."""
-        x, y = pixel_grid_mm(height, width, mm_per_pixel, torch.float64)
-        x, y = x.expand(height, width), y.expand(height, width)
         weight, start = self.tensor(), 0
         maps = []
         for degree in self.degrees().values():
-            basis = position_basis(x, y, self.half_mm, degree)
+            basis = image_basis(height, width, mm_per_pixel, self.half_mm, degree)
             maps.append(torch.tensordot(weight[:, start : start + len(basis)], basis, 1))
             start += len(basis)
         return torch.stack(maps)
@@ -116,27 +146,13 @@ class ResponseField:
         old = self.degrees()
         if any(term not in new or new[term] < d for term, d in old.items()):
             raise ValueError(f"degree, product_degree, cubic_degree: expected a family that holds {old}, got {new}")
-        rows: list[tuple[float, ...]] = []
-        for row in self.coefficient:
-            numbers = iter(row)
-            known = {(term, i, j): next(numbers) for term, d in old.items() for i in range(d + 1) for j in range(d + 1 - i)}
-            rows.append(
-                tuple(known.get((term, i, j), 0.0) for term, d in new.items() for i in range(d + 1) for j in range(d + 1 - i))
-            )
-        return ResponseField(degree, product_degree, self.half_mm, tuple(rows), cubic_degree)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain numbers, to seven digits, which is more than presses determine."""
-        return _plain(self)
-
-    @classmethod
-    def from_dict(cls, values: Any, source: str) -> "ResponseField":
-        """Read the output of :meth:`to_dict`; ``source`` names it in errors."""
-        return from_dict(cls, values, source)
+        known = [dict(zip(powers(old), row, strict=True)) for row in self.coefficient]
+        rows = tuple(tuple(row.get(key, 0.0) for key in powers(new)) for row in known)
+        return ResponseField(degree, product_degree, self.half_mm, rows, cubic_degree)
 
 
 @dataclass(frozen=True)
-class DepthBrightness:
+class DepthBrightness(_Coefficients):
     """What depth does to brightness: the skin comes nearer to the lights.
 
     A flat skin at depth z changes its relative brightness by c(x, y) z. Beyond a reference depth, at which the field holds, a slope
@@ -166,32 +182,14 @@ class DepthBrightness:
     def __post_init__(self) -> None:
         if check_integer("degree", self.degree, 0) > 2:
             raise ValueError(f"degree: expected at most 2, got {self.degree}")
-        object.__setattr__(self, "half_mm", check_positive("half_mm", self.half_mm))
         for name in ("steeper", "reference_mm"):
             object.__setattr__(self, name, check_least(name, getattr(self, name)))
-        size = (self.degree + 1) * (self.degree + 2) // 2
-        numbers = check_numbers("coefficient", self.coefficient, (3, size))
-        object.__setattr__(self, "coefficient", tuple(numbers[k * size : (k + 1) * size] for k in range(3)))
-
-    def tensor(self) -> Tensor:
-        """(3, size) float64."""
-        return torch.tensor(self.coefficient, dtype=torch.float64)
+        self._keep(3, monomials(self.degree))
 
     def maps(self, height: int, width: int, mm_per_pixel: float) -> Tensor:
         """The change at every pixel, (3, H, W) float64, 1 / mm."""
-        x, y = pixel_grid_mm(height, width, mm_per_pixel, torch.float64)
-        basis = position_basis(x.expand(height, width), y.expand(height, width), self.half_mm, self.degree)
-        maps: Tensor = torch.tensordot(self.tensor(), basis, 1)
+        maps: Tensor = torch.tensordot(self.tensor(), image_basis(height, width, mm_per_pixel, self.half_mm, self.degree), 1)
         return maps
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain numbers, to seven digits."""
-        return _plain(self)
-
-    @classmethod
-    def from_dict(cls, values: Any, source: str) -> "DepthBrightness":
-        """Read the output of :meth:`to_dict`; ``source`` names it in errors."""
-        return from_dict(cls, values, source)
 
 
 @dataclass(frozen=True)
@@ -244,12 +242,6 @@ class ResponseModel:
             values["by_depth"] = DepthBrightness.from_dict(values["by_depth"], f"{source}: by_depth")
         values.pop("taught", None)  # older files say how steep and deep their presses were
         return from_dict(cls, values, source)
-
-
-def _plain(field: ResponseField | DepthBrightness) -> dict[str, Any]:
-    values = dataclasses.asdict(field)
-    values["coefficient"] = [[float(f"{number:.7g}") for number in row] for row in field.coefficient]
-    return values
 
 
 def sine_from_slope(slope: Tensor) -> Tensor:
@@ -315,8 +307,7 @@ class SensorPrior:
 
     def background(self, height: int, width: int, mm_per_pixel: float) -> Tensor:
         """The smooth background of the unit it was fitted to, (3, H, W) float64, linear light."""
-        x, y = pixel_grid_mm(height, width, mm_per_pixel, torch.float64)
-        basis = position_basis(x.expand(height, width), y.expand(height, width), self.half_mm, 4)
+        basis = image_basis(height, width, mm_per_pixel, self.half_mm, 4)
         log_light: Tensor = torch.tensordot(torch.tensor(self.log_background, dtype=torch.float64), basis, 1)
         return log_light.exp()
 
@@ -364,8 +355,7 @@ def fit_log_background(background: Tensor, mm_per_pixel: float) -> tuple[tuple[f
         mm_per_pixel: pixel pitch, mm.
     """
     height, width = background.shape[1:]
-    x, y = pixel_grid_mm(height, width, mm_per_pixel, torch.float64)
-    basis = position_basis(x.expand(height, width), y.expand(height, width), 0.5 * width * mm_per_pixel, 4).flatten(1)
+    basis = image_basis(height, width, mm_per_pixel, 0.5 * width * mm_per_pixel, 4).flatten(1)
     values = background.double().clamp_min(1e-3).log().flatten(1)
     solution = torch.linalg.lstsq(basis.t(), values.t()).solution  # (15, 3)
     return tuple(tuple(float(v) for v in column) for column in solution.t())
@@ -375,6 +365,11 @@ def term_degrees_by_term(degree: int, product_degree: int, cubic_degree: int = -
     """Degree in position of every term, in order: the three changes, then their products of two, and of three."""
     orders = enumerate((degree, product_degree, cubic_degree), start=1)
     return {term: d for order, d in orders if d >= 0 for term in combinations_with_replacement(range(3), order)}
+
+
+def powers(degrees: dict[tuple[int, ...], int]) -> list[tuple[tuple[int, ...], int, int]]:
+    """Of every coefficient, in order: its term, and the powers of x and of y."""
+    return [(term, i, j) for term, degree in degrees.items() for i in range(degree + 1) for j in range(degree + 1 - i)]
 
 
 def monomials(degree: int) -> int:
@@ -390,6 +385,12 @@ def position_basis(x: Tensor, y: Tensor, half_mm: float, degree: int) -> Tensor:
         columns.append(columns[-1] * u)
         rows.append(rows[-1] * v)
     return torch.stack([columns[i] * rows[j] for i in range(degree + 1) for j in range(degree + 1 - i)])
+
+
+def image_basis(height: int, width: int, mm_per_pixel: float, half_mm: float, degree: int) -> Tensor:
+    """:func:`position_basis` at every pixel of an image, (n, H, W) float64."""
+    x, y = pixel_grid_mm(height, width, mm_per_pixel, torch.float64)
+    return position_basis(x.expand(height, width), y.expand(height, width), half_mm, degree)
 
 
 def term_values(change: Tensor, x: Tensor, y: Tensor, half_mm: float, degrees: dict[tuple[int, ...], int]) -> Tensor:

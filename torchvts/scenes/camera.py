@@ -20,9 +20,6 @@ from ..core.geometry import pixel_grid_mm
 from ..model.lights import PointLights, cast_shadows, near_field_shading
 from .surfaces import Scene
 
-MOST_SPOTS = 100_000
-"""So many spots wear out any skin."""
-
 
 def render(
     scene: Scene,
@@ -96,7 +93,7 @@ def skin_spots(height: int, width: int, spots: int = 30, dead_pixels: int = 30, 
         The factor (1, 1, H, W) in [0, 1].
     """
     check_image_size("height", height, "width", width)
-    check_integer("spots", spots, 0, MOST_SPOTS), check_integer("dead_pixels", dead_pixels, 0, MOST_SPOTS)
+    check_integer("spots", spots, 0), check_integer("dead_pixels", dead_pixels, 0)
     generator = torch.Generator().manual_seed(check_seed("seed", seed))
     x, y = pixel_grid_mm(height, width, 1.0)
     factor = torch.ones(height, width)

@@ -1,4 +1,4 @@
-"""Objects pressed straight into the skin: ball, capsule, cone, texture, punch and letters, as exact scenes."""
+"""Objects pressed straight into the skin: ball, capsule, cone, texture, punch and letters, as exact scenes of :func:`surface`."""
 
 import math
 
@@ -26,11 +26,7 @@ def sphere_press(
         radius_mm: radius of the ball, mm.
         press_mm: how far the ball is pressed in, at most its radius, mm.
         center_mm: (x, y) of its centre in image axes, mm.
-        height: rows of the image.
-        width: columns of the image.
-        mm_per_pixel: pixel pitch, mm.
-        dtype: type of the returned maps.
-        camera_height_mm: height of a pinhole camera, mm; infinite for an orthographic camera.
+        height, width, mm_per_pixel, dtype, camera_height_mm: as for :func:`surface`.
     Example:
         >>> round(float(sphere_press(10.0, 2.0).depth_mm.max()), 3)
         2.0
@@ -39,8 +35,7 @@ def sphere_press(
     check_numbers("center_mm", center_mm, (2,))
 
     def depth(x: Tensor, y: Tensor) -> Tensor:
-        squared = (x - center_mm[0]) ** 2 + (y - center_mm[1]) ** 2
-        return _cap(squared, radius_mm, press_mm)
+        return _cap((x - center_mm[0]) ** 2 + (y - center_mm[1]) ** 2, radius_mm, press_mm)
 
     return surface(depth, height, width, mm_per_pixel, dtype, camera_height_mm)
 
@@ -64,10 +59,7 @@ def cylinder_press(
         length_mm: length of the straight part, mm.
         angle_deg: direction of its axis, from x towards y (down), degrees.
         center_mm: (x, y) of its middle in image axes, mm.
-        height: rows of the image.
-        width: columns of the image.
-        mm_per_pixel: pixel pitch, mm.
-        dtype: type of the returned maps.
+        height, width, mm_per_pixel, dtype: as for :func:`surface`.
     """
     check_positive("press_mm", press_mm, check_positive("radius_mm", radius_mm))
     check_numbers("center_mm", center_mm, (2,))
@@ -98,10 +90,7 @@ def cone_press(
         press_mm: how far the tip is pressed in, mm.
         tip_radius_mm: radius of the tip, mm.
         center_mm: (x, y) of the axis in image axes, mm.
-        height: rows of the image.
-        width: columns of the image.
-        mm_per_pixel: pixel pitch, mm.
-        dtype: type of the returned maps.
+        height, width, mm_per_pixel, dtype: as for :func:`surface`.
     """
     half_angle_deg = check_positive("half_angle_deg", half_angle_deg, 89.9)
     check_positive("press_mm", press_mm), check_positive("tip_radius_mm", tip_radius_mm)
@@ -133,10 +122,7 @@ def sine_press(
         amplitude_mm: amplitude of the texture, mm.
         period_mm: period of the texture in x and in y, mm.
         radius_mm: radius of the pad, mm.
-        height: rows of the image.
-        width: columns of the image.
-        mm_per_pixel: pixel pitch, mm.
-        dtype: type of the returned maps.
+        height, width, mm_per_pixel, dtype: as for :func:`surface`.
     """
     check_positive("amplitude_mm", amplitude_mm), check_positive("period_mm", period_mm), check_positive("radius_mm", radius_mm)
     wave = 2.0 * torch.pi / period_mm
@@ -165,10 +151,7 @@ def punch_press(
         press_mm: depth in the middle, mm.
         tilt_deg: tilt about y, degrees.
         wall_mm: width of the flank, mm.
-        height: rows of the image.
-        width: columns of the image.
-        mm_per_pixel: pixel pitch, mm.
-        dtype: type of the returned maps.
+        height, width, mm_per_pixel, dtype: as for :func:`surface`.
     """
     check_positive("radius_mm", radius_mm), check_positive("press_mm", press_mm), check_positive("wall_mm", wall_mm)
     check_least("tilt_deg", tilt_deg, -math.inf)
@@ -200,10 +183,7 @@ def letters_press(
         size_mm: height of a letter in the image, mm.
         stroke_mm: width of the flat top of a stroke, mm.
         bevel_mm: width of the flank, mm.
-        height: rows of the image.
-        width: columns of the image.
-        mm_per_pixel: pixel pitch, mm.
-        dtype: type of the returned maps.
+        height, width, mm_per_pixel, dtype: as for :func:`surface`.
     Raises:
         ValueError: a character that is not a capital letter, or an empty text.
     """
@@ -212,8 +192,7 @@ def letters_press(
     segments = letter_segments(text, size_mm)
 
     def depth(x: Tensor, y: Tensor) -> Tensor:
-        distance = distance_to_segments(x, y, segments)
-        return press_mm * (1.0 - smooth_step((distance - 0.5 * stroke_mm) / bevel_mm))
+        return press_mm * (1.0 - smooth_step((distance_to_segments(x, y, segments) - 0.5 * stroke_mm) / bevel_mm))
 
     return surface(depth, height, width, mm_per_pixel, dtype)
 

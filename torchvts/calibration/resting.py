@@ -7,12 +7,12 @@ import torch
 from torch import Tensor
 
 from ..core.blur import band_of_ratios, blur, gaussian_weights
-from ..core.geometry import pixel_grid_mm
 from ..core.levels import SATURATED
 from ..core.morphology import dilate
 from ..core.robust import TUKEY, tukey_weight
 from ..model.calibration import PEDESTAL, Calibration
-from ..model.response_field import position_basis
+from ..model.response_field import image_basis
+from ..skin.weight import WEIGHT_CELLS
 from .presses import Press
 from .touching import depth_of
 
@@ -22,9 +22,6 @@ its own."""
 
 LEAST_STRUCTURE = 0.01
 """Smallest such excess: less is noise. A press has 0.02 to 0.7."""
-
-RESTING_CELLS = 60
-"""Cells along the shorter side, on which structure and smooth light are found."""
 
 DEGREE = 4
 """Degree in position of the logarithm of smooth light: that of a prior's pattern."""
@@ -93,25 +90,20 @@ def _smooth(unit: Calibration) -> Tensor:
     log = torch.nn.functional.avg_pool2d(light[None].double(), cell)[0].clamp_min(1e-3).log()
     height, width = light.shape[1:]
     half_mm = 0.5 * width * pitch_mm
-    basis = position_basis(*_grid(log.shape[1], log.shape[2], cell * pitch_mm), half_mm, DEGREE).flatten(1).t()
+    basis = image_basis(log.shape[1], log.shape[2], cell * pitch_mm, half_mm, DEGREE).flatten(1).t()
     values, weight = log.flatten(1).t(), torch.ones(basis.shape[0], 1, dtype=torch.float64)
     for _ in range(RESTING_ROUNDS):
         solution = torch.linalg.solve(basis.t() @ (weight * basis), basis.t() @ (weight * values))
         left = values - basis @ solution
         scale = left.abs().median(dim=0).values / 0.6745 + 1e-3
         weight = tukey_weight((left / (TUKEY * scale)).square().mean(dim=1, keepdim=True).sqrt())
-    whole = position_basis(*_grid(height, width, pitch_mm), half_mm, DEGREE).flatten(1)
+    whole = image_basis(height, width, pitch_mm, half_mm, DEGREE).flatten(1)
     smooth: Tensor = (solution.t() @ whole).exp().reshape(3, height, width).to(light.dtype)
     return smooth
 
 
-def _grid(height: int, width: int, pitch_mm: float) -> tuple[Tensor, Tensor]:
-    x, y = pixel_grid_mm(height, width, pitch_mm, torch.float64)
-    return x.expand(height, width), y.expand(height, width)
-
-
 def _cell(image: Tensor) -> int:
-    return max(1, min(image.shape[1:]) // RESTING_CELLS)
+    return max(1, min(image.shape[1:]) // WEIGHT_CELLS)
 
 
 def _margin(structure: Tensor) -> int:

@@ -19,14 +19,11 @@ from ..model.lights import inverse_light_matrix
 from ..model.usable import FrameCheck
 from ..pipeline import DepthPipeline, usual_unseen_deg
 from ..skin import DotMotion, motion_of_unit
-from ..skin.weight import spread_of
+from ..skin.weight import WEIGHT_CELLS, spread_of
 from .camera import levels_of
 
 TILTED_DEG = 3.0
 """Tilt from which a normal counts as one of a contact."""
-
-CELLS = 60
-"""Cells along the shorter side over which changes of free skin are averaged."""
 
 MISFITS = 0.05
 """Share of a contact in which the length of the normals may be off by three standard deviations; without a cause it is 0.003."""
@@ -127,7 +124,7 @@ class Examination:
 
     def spread_deg(self, slopes: Tensor) -> float:
         """The same of slopes (1, 2, H, W)."""
-        cells = whole_cell_means(slopes, max(1, min(self.image.shape[1:]) // CELLS))
+        cells = whole_cell_means(slopes, max(1, min(self.image.shape[1:]) // WEIGHT_CELLS))
         return math.degrees(math.atan(float(spread_of(cells.abs().flatten(2), 1e-9).max())))
 
     # ---- the camera ----
@@ -200,7 +197,7 @@ class Examination:
 
         An LED changes one channel; a slope takes light from one channel and gives it to another; dirt takes it from all.
         """
-        side = max(1, min(self.image.shape[1:]) // CELLS)
+        side = max(1, min(self.image.shape[1:]) // WEIGHT_CELLS)
         with torch.no_grad():
             light = self.pipeline.compensate(self.raw[None].to(self.unit.background.dtype)) / self.unit.flat.clamp_min(1e-6)
         free = whole_cell_means(self.free[None, None].double(), side)[0, 0] > 0.5

@@ -61,8 +61,8 @@ class _Coefficients:
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers, to seven digits, which is more than presses determine."""
         rows = [[float(f"{number:.7g}") for number in row] for row in self.coefficient]
-        values: dict[str, Any] = dataclasses.asdict(self)  # type: ignore[call-overload]
-        return values | {"coefficient": rows}
+        plain: dict[str, Any] = dataclasses.asdict(self)  # type: ignore[call-overload]
+        return plain | {"coefficient": rows}
 
     @classmethod
     def from_dict(cls: type[_Kind], values: Any, source: str) -> _Kind:

@@ -139,14 +139,8 @@ def undeformed(scene: Scene) -> Scene:
     check_record("scene", scene, Scene, "sphere_press and the other presses make one")
     flat = torch.zeros_like(scene.normal)
     flat[:, 2] = 1.0
-    return Scene(
-        torch.zeros_like(scene.depth_mm),
-        torch.zeros_like(scene.gradient),
-        flat,
-        torch.zeros_like(scene.contact),
-        scene.mm_per_pixel,
-        scene.camera_height_mm,
-    )
+    depth_mm, gradient, contact = (torch.zeros_like(part) for part in (scene.depth_mm, scene.gradient, scene.contact))
+    return scene._replace(depth_mm=depth_mm, gradient=gradient, normal=flat, contact=contact)
 
 
 def smooth_step(t: Tensor) -> Tensor:

@@ -384,16 +384,19 @@ def calibration_figure(calibration: Calibration, presses: Sequence[Press]) -> Fi
     for row in rows.values():
         _circle(axes[0, 0], row)
     if (error := error_over_skin(calibration)) is not None:
-        most = float(error.flatten().quantile(0.9))  # corners, where no ball fits, would take all colours
+        least = float(error.min())
+        most = max(1.5 * least, float(error.flatten().quantile(0.9)))  # corners, where no ball fits, would take all colours
         extent = (-0.5, width - 0.5, height - 0.5, -0.5)
-        drawn = axes[0, 1].imshow(error.numpy(), cmap="cividis", vmin=float(error.min()), vmax=most, extent=extent)
+        drawn = axes[0, 1].imshow(error.numpy(), cmap="cividis", vmin=least, vmax=most, extent=extent)
         axes[0, 1].set_title("error expected, degrees", fontsize=9)
+        axes[0, 1].set(xlim=extent[:2], ylim=extent[2:])  # circles may reach beyond
         if calibration.metric and (least_known := press_next(calibration)) is not None:
             axes[0, 1].plot(*least_known[0], "+", color="white", markersize=9, path_effects=_HALO)
         figure.colorbar(drawn, ax=axes[0, 1], shrink=0.7, extend="max")
         for row in rows.values():
             _circle(axes[0, 1], row)
-    axes[0, 2].text(0.0, 1.0, _facts(calibration), fontsize=9, va="top", transform=axes[0, 2].transAxes)
+    facts = _facts(calibration) + (f"\n{len(shown)} of {len(given)} presses below" if len(shown) < len(given) else "")
+    axes[0, 2].text(0.0, 1.0, facts, fontsize=9, va="top", transform=axes[0, 2].transAxes)
     for k, press in enumerate(shown):
         image, left = axes[1 + k // 2, 2 * (k % 2)], axes[1 + k // 2, 2 * (k % 2) + 1]
         row = rows[press.name]
@@ -416,7 +419,8 @@ def calibration_figure(calibration: Calibration, presses: Sequence[Press]) -> Fi
 
 def _facts(calibration: Calibration) -> str:
     report = calibration.report
-    words = {"own_deg": "on its own presses", "held_out_deg": "on each press by the others", "stated_deg": "expected anywhere"}
+    own = "on its own presses" if "presses" in report else "on the units of its prior"
+    words = {"own_deg": own, "held_out_deg": "on each press by the others", "stated_deg": "expected anywhere"}
     errors = [(text, report.get(key)) for key, text in words.items()]
     figures = [f"{text}: {value:.2f} degrees" for text, value in errors if isinstance(value, float)]
     return "\n".join(

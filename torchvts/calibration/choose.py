@@ -88,6 +88,8 @@ def _from_prior(background: Tensor, sensor: Sensor, prior: SensorPrior) -> Made:
     report: Report = {"model": "response", "source": "prior", "reason": reason, "prior_deg": prior.expected_deg}
     if prior.own_deg is not None:
         report["own_deg"] = prior.own_deg
+    if prior.expected_deg is not None:
+        report["stated_deg"] = prior.expected_deg
     family = Family.of(prior.response.field)
     covariance = Evidence(family, ()).posterior(prior_of(family, (), prior)).covariance
     unit = Calibration.from_response(model, sensor, background, report, covariance)

@@ -24,7 +24,7 @@ from ..calibration.presses import check_presses
 from ..core.checks import check_positive
 from ..core.containers import find_container
 from ..core.files import check_folder, make_folder
-from ..model import Calibration, Sensor
+from ..model import Calibration, Sensor, shipped_sensors
 from ..model.summary import summary_of
 from ..stream import StageClock, frames, open_source, read_background, read_press_images
 from ..stream.numbered import SourceFrames
@@ -65,7 +65,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Calibrate, write the file, and print what was chosen."""
     if (arguments.sensor is None) == (arguments.mm_per_pixel is None):
-        raise UsageError("expected either --sensor or --mm-per-pixel")
+        raise UsageError(f"expected either --sensor or --mm-per-pixel; shipped sensors: {', '.join(shipped_sensors())}")
     if arguments.sensor is not None and arguments.gamma is not None:
         raise UsageError("--gamma: expected it beside --mm-per-pixel, --sensor has the file's: write gamma into the sensor file")
     check_target_of(arguments.out)
@@ -98,6 +98,9 @@ def by_hand(arguments: argparse.Namespace, picture: Path) -> int:
     if session.background is None:
         raise lost or ValueError(f"--camera: expected a still, untouched skin first, got none: {guide.watch.why_not_at_rest()}")
     unit = guide.unit or calibrated(session.background, sensor, session.presses, arguments.force)
+    judged = {row["name"] for row in unit.report.get("presses", [])}
+    if waiting := [press.name for press in session.presses if press.name not in judged]:
+        print(f"press {', '.join(waiting)}: stored, and not yet in the file")
     if not guide.reached:
         print(f"ended before {until_deg:g} degrees were stated; the same command goes on")
     status = write(unit, session.presses, arguments, picture)
@@ -113,8 +116,11 @@ def write(calibration: Calibration, presses: Sequence[Press], arguments: argpars
     save_figure(calibration_figure(calibration, check_presses(presses, calibration.sensor)), picture)
     print(summary_of(calibration, arguments.candidates))
     print(f"wrote {arguments.out} ({arguments.out.stat().st_size / 1000:.0f} kB), and {picture}: what it was made of")
+    if not calibration.metric:
+        print("next: mend what the doubts name, and calibrate again: until then depth is in no known unit")
+        return 1
     print(f"next: torchvts reconstruct {arguments.out} IMAGE --out FOLDER, or torchvts view {arguments.out} 0 for a camera, live")
-    return 0 if calibration.metric else 1
+    return 0
 
 
 def check_target_of(out: Path) -> None:

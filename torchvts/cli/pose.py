@@ -84,7 +84,7 @@ def of_clouds(arguments: argparse.Namespace, source_file: Path, target_file: Pat
                 f"--unit m reads them so, this was read as {arguments.length_unit}"
             )
     found = register_points(source, target, source_normals=source_normals, target_normals=target_normals)
-    print_result(source_file.stem, found)
+    print_result(source_file.stem, found, source, target)
     draw(arguments, source_file.stem, source, target, found, frame)
     return [record(source_file.stem, found, frame)]
 
@@ -122,10 +122,11 @@ def of_frames(arguments: argparse.Namespace, unit: Path, source: Path, reference
             continue
         last = found.T_target_source if found.converged else last
         results.append(record(name, found, written))
+        points = contact_cloud(frame, pitch, 4000)[0]
         if len(results) <= 20:
-            print_result(name, found)
+            print_result(name, found, points, target_points)
         if count == 1:
-            draw(arguments, name, contact_cloud(frame, pitch, 4000)[0], target_points, found, written)
+            draw(arguments, name, points, target_points, found, written)
     return results
 
 
@@ -146,15 +147,19 @@ def record(name: str, found: Registration, written: OutputFrame) -> dict[str, An
     }
 
 
-def print_result(name: str, found: Registration) -> None:
-    """Print a pose in words."""
+def print_result(name: str, found: Registration, source: torch.Tensor, target: torch.Tensor) -> None:
+    """Print a pose in words; where it is one of several that fit, also how the contact has moved, of points (N, 3), mm."""
     T = found.T_target_source
     turn = float(torch.rad2deg(torch.atan2(T[1, 0], T[0, 0])))
     tilt = float(torch.rad2deg(torch.acos(T[2, 2].clamp(-1, 1))))
     x, y, z = T[:3, 3].tolist()
     fit = f", rmse {1000 * found.rmse_mm:.1f} um" if math.isfinite(found.rmse_mm) else ""
     print(f"{name}: {'converged' if found.converged else 'NOT converged'}{fit}: {found.message}")
-    which = "one of the poses that fit: " if found.ambiguous or found.alternatives else ""
+    which = ""
+    if found.ambiguous or found.alternatives:
+        right, up = (target.double().mean(0) - source.double().mean(0))[:2].tolist()
+        print(f"{name}: whichever pose it is, the middle of the contact moved by ({right:.2f}, {up:.2f}) mm, x right, y up")
+        which = "one of the poses that fit: "
     print(f"{name}: {which}turned {turn:.3f} degrees in the plane, tilted {tilt:.3f}, moved ({x:.4f}, {y:.4f}, {z:.4f}) mm")
 
 

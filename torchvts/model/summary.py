@@ -68,7 +68,7 @@ def where_next(calibration: Calibration) -> str:
     sensor = calibration.sensor
     x, y = ((n - 0.5 * (size - 1)) * sensor.mm_per_pixel for n, size in zip(place, (sensor.width, sensor.height), strict=True))
     where = f"x {place[0]}, y {place[1]} px of rectified images ({x:+.1f}, {y:+.1f} mm from the middle)"
-    return f"around {where}: there normals are expected to about {error_deg:.1f} degrees"
+    return f"around {where}: the middle of a contact is known least there, to about {error_deg:.1f} degrees"
 
 
 def doubts_of(report: Report) -> list[str]:

@@ -280,7 +280,7 @@ def _draw_bounds(figure: Any) -> None:
 
 
 def learning_figure(rows: Sequence[Row]) -> Figure:
-    """Error against the number of presses: means over draws of presses, with the smallest and the largest draw.
+    """Error against the number of presses: means over the frames of all draws of presses, with the smallest and the largest draw.
 
     Args:
         rows: one for each draw, ``seed``: ``method`` names the line, the error "count" is the number of presses;
@@ -296,12 +296,14 @@ def learning_figure(rows: Sequence[Row]) -> Figure:
         for k, line in enumerate(lines):
             own = [row for row in rows if (row.data, row.method) == line and row.error(error) is not None]
             counts = sorted({row.errors["count"] or 0.0 for row in own})
-            draws = [[row.errors[error] or 0.0 for row in own if row.errors["count"] == count] for count in counts]
+            rows_of = [[row for row in own if row.errors["count"] == count] for count in counts]
+            draws = [[row.errors[error] or 0.0 for row in some] for some in rows_of]
+            means = [statistics.fmean(d, [row.frames for row in some]) for d, some in zip(draws, rows_of, strict=True)]
             places = [count + 0.08 * (k - 0.5 * (len(lines) - 1)) for count in counts]  # so that bars stand side by side
             color, marker = _LINES[k % len(_LINES)]
             dashes = ("-", "--", ":")[k // len(_LINES) % 3]
             name = ", ".join(line) if several else line[1]
-            axes.plot(places, [statistics.mean(d) for d in draws], color=color, marker=marker, ls=dashes, label=name)
+            axes.plot(places, means, color=color, marker=marker, ls=dashes, label=name)
             axes.vlines(places, [min(d) for d in draws], [max(d) for d in draws], color=color, lw=1.4, alpha=0.6)
         for row in levels:
             if (level := row.error(error)) is not None:
@@ -311,6 +313,6 @@ def learning_figure(rows: Sequence[Row]) -> Figure:
         axes.grid(alpha=0.3)
     handles, labels = panels[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=2, fontsize=9, frameon=False)
-    title = f"means of {len({row.seed for row in rows})} draws of presses; vertical lines: smallest and largest draw"
+    title = f"means over the frames of {len({row.seed for row in rows})} draws of presses; vertical lines: smallest and largest draw"
     figure.suptitle(title if several else f"{lines[0][0]}: {title}", fontsize=9)
     return figure

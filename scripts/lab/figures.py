@@ -313,6 +313,6 @@ def learning_figure(rows: Sequence[Row]) -> Figure:
         axes.grid(alpha=0.3)
     handles, labels = panels[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=2, fontsize=9, frameon=False)
-    title = f"means over the frames of {len({row.seed for row in rows})} draws of presses; vertical lines: smallest and largest draw"
+    title = f"means over the frames of {len({row.seed for row in rows})} draws of presses; lines: smallest and largest draw"
     figure.suptitle(title if several else f"{lines[0][0]}: {title}", fontsize=9)
     return figure

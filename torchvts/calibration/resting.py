@@ -57,9 +57,9 @@ def beside_presses(background: Tensor, presses: Sequence[Press]) -> str:
     row, column = divmod(int(excess.argmax()), own.shape[1])
     place = [round((k + _margin(own) + 0.5) * cell) for k in (column, row)]
     return (
-        f"background: structure between the channels of {most:.2f} around pixel ({place[0]}, {place[1]}), where the presses have "
-        f"none (their contacts have {contact:.2f}): was a press given as the background? take it again without contact; "
-        "what is said of presses may come from it"
+        "background: was a press given as the background? take it again without contact; what is said of presses may come from "
+        f"it. Around pixel ({place[0]}, {place[1]}) its channels differ by {most:.2f} within millimetres, and those of the presses "
+        f"do not (in their contacts {contact:.2f})"
     )
 
 

@@ -28,7 +28,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_out(parser, "for the files")
     add_mode(parser, "fast")
     add_network(parser)
-    parser.add_argument("--format", nargs="+", default=list(export.FORMATS), metavar="NAME", help=f"of {', '.join(export.FORMATS)}; a plan is pipe.freeze().save(FILE)")
+    names = f"of {', '.join(export.FORMATS)}; a plan for C is pipe.freeze().save(FILE)"
+    parser.add_argument("--format", nargs="+", default=list(export.FORMATS), metavar="NAME", help=names)
     parser.add_argument("--frames", type=Path, metavar="INPUT", help="image, folder or video to compare on too; 8 frames at most")
 
 

@@ -14,7 +14,7 @@ from typing import NamedTuple
 from torch import Tensor
 
 from torchvts import Press, Sensor, calibrate
-from torchvts.calibration.outliers import CORE, DOUBTED
+from torchvts.calibration import LEAST_WEIGHT
 from torchvts.core.tables import markdown
 
 from . import sets
@@ -33,10 +33,6 @@ WITH_MISTAKES = (3, 6)
 
 NOT_CHECKED = "not checked"
 """How a sentence begins that says what the images cannot show."""
-
-
-LEFT_OUT = (CORE / DOUBTED) ** 4
-"""A press that counts less is counted as left out: it is named."""
 
 
 class Given(NamedTuple):
@@ -90,7 +86,7 @@ def answer(unit: str, mistake: str, given: Given) -> Answer:
             made = calibrate(given.background, given.sensor, presses=given.presses)
         except ValueError as error:
             return Answer(unit, prior, mistake, names, str(error), (), (), False)
-    out = tuple(row["name"] for row in made.report.get("presses", []) if row["weight"] < LEFT_OUT)
+    out = tuple(row["name"] for row in made.report.get("presses", []) if row["weight"] < LEAST_WEIGHT)
     return Answer(unit, prior, mistake, names, "", out, tuple(made.report["doubts"]), made.metric)
 
 

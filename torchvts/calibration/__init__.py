@@ -4,6 +4,7 @@ from .by_lights import GIVEN_MISFIT
 from .contacts import ROUGH, channel_structure
 from .doubts import CalibrationWarning
 from .lights import POORLY_CONSTRAINED_DEG, LightFit, fit_lights
+from .outliers import LEAST_WEIGHT
 from .press_model import RESPONSE_BLUR_PX, by_presses, with_preprocessing
 from .presses import Press, read_presses
 from .prior import PriorUnit, fit_prior, score_prior
@@ -11,6 +12,7 @@ from .unit import calibrate
 
 __all__ = [
     "GIVEN_MISFIT",
+    "LEAST_WEIGHT",
     "POORLY_CONSTRAINED_DEG",
     "RESPONSE_BLUR_PX",
     "ROUGH",

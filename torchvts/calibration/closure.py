@@ -77,7 +77,7 @@ class _Rating:
         prior = Prior(torch.zeros(2, family.size(), dtype=torch.float64), PENALTY * family.penalty())
         coefficient = evidence.posterior(prior).mean
         net = torch.stack([_net_slope(item.contact, item.slope(coefficient)) for item in evidence.forms])
-        angles = torch.tensor(evidence.errors_deg([one.mean for one in evidence.held_out(prior)]), dtype=torch.float64)
+        angles = torch.tensor(evidence.held_out_deg(prior), dtype=torch.float64)
         self.family, self.contacts = family, contacts
         self.inside_deg = float(angles.square().mean().sqrt())
         # (N, 2), mm: within the contact a shift by d changes the slope by about d / radius of the ball

@@ -29,10 +29,13 @@ NOISE = 0.1
 """Standard deviation of the gain of a press by the field of others that cover its place."""
 
 DOUBTED = 3.0
-"""So many standard deviations off, a press is named; by its size it counts a sixteenth."""
+"""So many standard deviations off, a press is named."""
 
 CORE = 1.5
 """Standard deviations of its size up to which a press counts wholly."""
+
+LEAST_WEIGHT = (CORE / DOUBTED) ** 4
+"""What a press counts whose size is named: less is hardly a press."""
 
 ROUNDS = 12
 """Weights and gains in turn."""

@@ -120,6 +120,10 @@ class Evidence:
         others = self.weights * (1.0 - torch.eye(len(self.forms), dtype=torch.float64))
         return [self.posterior(prior, weights) for weights in others]
 
+    def held_out_deg(self, prior: Prior) -> list[float]:
+        """For each press the mean angle by all others, degrees."""
+        return self.errors_deg([one.mean for one in self.held_out(prior)])
+
     def variances(self, covariances: Sequence[Tensor]) -> Tensor:
         """(N,): for each press the mean variance of its sines, phi' C phi, by its covariance (K, K)."""
         inside = [item.terms[:, item.contact.inside()] for item in self.forms]

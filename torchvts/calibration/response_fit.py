@@ -89,7 +89,7 @@ def fit_response(contacts: list[Contact], sensor: Sensor, prior: SensorPrior | N
         own_deg = _mean(evidence.errors_deg([found.mean] * len(presses)), evidence.weights)
         held_out_deg = None
         if len(presses) >= FEW:
-            held_out_deg = _mean(evidence.errors_deg([one.mean for one in evidence.held_out(before)]), evidence.weights)
+            held_out_deg = _mean(evidence.held_out_deg(before), evidence.weights)
         bar.update()
         bar.set_postfix(step="depth")
         by_depth = fit_depth_brightness(presses, found.field, pitch, None if prior is None else prior.response.by_depth)

@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from ..calibration import Press
+from ..calibration import LEAST_WEIGHT, Press
 from ..core.checks import in_one_line
 from ..core.files import Pixels, check_folder, image_to_bytes, make_folder, rgb_from_bgr, write_atomically
 from ..model import Calibration, Sensor
@@ -21,9 +21,6 @@ from ..stream.background import check_steady, is_touched
 from ..stream.numbered import NumberedFrame
 from ..viz import calibration_figure, save_figure
 from .options import calibrated, read_folder
-
-LEAST_WEIGHT = 1 / 16
-"""A press that counts less, by what the others expect of it, is refused."""
 
 LONG = 300
 """Frames after which a press that is not lifted is perhaps none."""

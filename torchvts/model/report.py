@@ -82,7 +82,7 @@ class Report(_ReportKeys, total=False):
         presses: one row per press.
         held_out_deg: mean error on presses by a response fitted to the other presses, degrees; None with too few presses.
         own_deg: mean error on the very presses that a response, or its prior, was fitted to, degrees.
-        stated_deg: error of normals to expect anywhere on the skin, by the covariance of the field, degrees.
+        stated_deg: error of normals to expect anywhere on the skin, degrees: by the covariance, or the record of a prior alone.
         prior_deg: where the sensor's prior is the model, or what presses were fitted from: its mean error on presses and units that
             it was not fitted to, degrees; None where its file does not say.
         family: of the lights, in words.

@@ -88,12 +88,12 @@ def expected(calibration: Calibration) -> str:
         if spread is None:
             return "as good as the positions of the lights that were given; presses of a ball would measure it"
         return f"directions of the lights to {max(spread):.2f} degrees (standard deviation of the worst)"
-    by_type = report.get("prior_deg") if report["source"] == "prior" else None
-    degrees = f"normals within a contact to about {report.get('stated_deg', by_type or UNKNOWN_DEG):.1f} degrees"
+    stated = "stated_deg" in report
+    degrees = f"normals within a contact to about {report.get('stated_deg', UNKNOWN_DEG):.1f} degrees"
     if report["source"] == "prior":
-        how = "the mean over units that its prior was tried on" if by_type else "a guess: its prior was never tried"
+        how = "the mean over units that its prior was tried on" if stated else "a guess: its prior was never tried"
         return f"{degrees}, {how}; presses of a ball would measure it on this one"
-    if "stated_deg" not in report:
+    if not stated:
         return f"{degrees}, a guess; presses of a ball would measure it"
     if report.get("held_out_deg"):
         used = sum(row["used"] for row in report.get("presses", []))

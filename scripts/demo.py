@@ -71,7 +71,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 def real(folder: Path, picture: Path) -> None:
     """A ball pressed into a real sensor, calibrated by its background and the prior of its type."""
     background, presses = vts.read_presses(folder)
-    sensor, press = vts.Sensor.load("gelsight_mini"), presses[0]
+    sensor, middle = vts.Sensor.load("gelsight_mini"), [0.5 * size for size in (background.shape[2], background.shape[1])]
+    press = min(presses, key=lambda one: math.dist(one.center_px or (0.0, 0.0), middle))  # most of the ball is in view
     pipe = vts.DepthPipeline.from_calibration(vts.calibrate(background, sensor)).freeze()
     out = pipe(press.image[None])
     title = f"a ball of {press.ball_diameter_mm:g} mm on a GelSight Mini, by its background alone"

@@ -201,7 +201,8 @@ def set_figure(evaluation: Evaluation) -> Figure:
         error = _relief_error(evaluation.outputs[name].depth_mm, shown.truth)
         most = float(error.nan_to_num().abs().quantile(0.998)) or 1.0
         colors, norm = depth_colors(-most, most)
-        draw_bar(figure, lower, lower.imshow(error.numpy(), cmap=colors, norm=norm), "um")
+        extent = (*upper.get_xlim(), *upper.get_ylim())  # mm, as above
+        draw_bar(figure, lower, lower.imshow(error.numpy(), cmap=colors, norm=norm, extent=extent), "um")
         lower.set_title(f"error of relief, RMS {float(error.square().nanmean().sqrt()):.1f} um", fontsize=9)
     figure.suptitle(f"{evaluation.data.name}, {shown.name}; contact in orange, the true one dotted", fontsize=11)
     return figure

@@ -1,14 +1,11 @@
 """How often errors lie within the bounds that confidence states: a table and a picture.
 
-python scripts/confidence.py --presses ../shared/data/gelsight_mini_a --sensor gelsight_mini
-
+python scripts/confidence.py --frames 10
 python scripts/confidence.py --drawn 700 701 702 703 704 705 706 707
 python scripts/confidence.py --sets gelsight_mini_a gelsight_mini_b gelsight_mini_c gelsight_pale digit_a
 
-The second: objects inside and outside of the range of slopes and depths of the calibration's presses. The third: real sets by 1 to
-12 presses, and frames of other cameras.
-
-Random exact scenes of four kinds of units, and presses of balls that calibration has not seen.
+The first: random exact scenes of four kinds of units. The second: objects inside and outside of the range of slopes and depths of
+the calibration's presses. The third: real sets by 1 to 12 presses, and frames of other cameras.
 """
 
 import argparse
@@ -17,11 +14,10 @@ from pathlib import Path
 
 import torch
 
-import torchvts as vts
 from lab import coverage, sets
 from lab.commands import main_of, parser_of
 from lab.figures import coverage_figure
-from lab.random_scenes import SHAPES, UNITS
+from lab.random_scenes import UNITS
 from lab.rows import to_json, write_files
 from torchvts.pipeline import MODES
 from torchvts.viz import save_figure
@@ -29,8 +25,6 @@ from torchvts.viz import save_figure
 
 def main(argv: Sequence[str] | None = None) -> int:
     parser = parser_of(__doc__)
-    parser.add_argument("--presses", type=Path, help="folder of ball presses in gs_sdk's layout, with labels")
-    parser.add_argument("--sensor", default="gelsight_mini", help="sensor of the presses: YAML file or shipped name")
     parser.add_argument("--frames", type=int, default=100, help="random scenes of each kind of unit")
     parser.add_argument("--out", type=Path, default=Path("out/confidence.png"), help="the picture; its table beside it, .json")
     parser.add_argument("--units", nargs="+", choices=UNITS, default=UNITS, metavar="UNIT", help=", ".join(UNITS))
@@ -66,26 +60,10 @@ def measure(arguments: argparse.Namespace) -> str:
         found = coverage.of_scenes(range(first, first + arguments.frames), unit, progress=True)
         rows += [coverage.mean(found, f"scenes, {unit}")] if found else []
         every += found
-    for shape in SHAPES:
-        found = [row for row in every if row.method == shape]
-        rows += [coverage.mean(found, f"scenes of all units, {shape}")] if found else []
-    curves = [coverage.mean(every, "scenes")]
-    if arguments.presses is not None:
-        sensor = vts.Sensor.load(arguments.sensor)
-        kinds = [
-            ("presses, no prior", sensor.without_prior(), True, "precise"),
-            ("presses, no prior, fast", sensor.without_prior(), True, "fast"),
-        ]
-        if sensor.prior is not None:
-            kinds += [("presses and prior", sensor, True, "precise"), ("prior alone", sensor, False, "precise")]
-        for name, kind, learn, mode in kinds:
-            found = coverage.of_presses(arguments.presses, kind, learn=learn, mode=mode, progress=True)
-            rows.append(coverage.mean(found, f"{arguments.presses.name}, {name}"))
-            curves.append(rows[-1])
-    drawn = [curve for curve in curves if not curve.data.endswith("fast")]  # it covers the line of mode precise
-    write_files(arguments.out.parent, {f"{arguments.out.stem}.json": to_json(drawn)})
-    save_figure(coverage_figure(drawn), arguments.out)
-    return coverage.table([*rows, curves[0]])
+    curve = coverage.mean(every, "scenes")
+    write_files(arguments.out.parent, {f"{arguments.out.stem}.json": to_json([curve])})
+    save_figure(coverage_figure(curve), arguments.out)
+    return coverage.table([*rows, curve])
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""How often errors lie within the bounds that confidence states: on random exact scenes, and on presses of balls."""
+"""How often errors lie within the bounds that confidence states: on random exact scenes, drawn sensors and real sets."""
 
 import math
 import random
@@ -10,13 +10,11 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from torchvts.calibration import Press
 from torchvts.core.geometry import normal_from_gradient
-from torchvts.model import Sensor
 from torchvts.pipeline import ConfidentOutput, ConfidentPipeline, bound_at
 from torchvts.pipeline.confidence import DEPTH_SPREAD
 from torchvts.scenes import objects as solids
-from torchvts.training.balls import Truth, ball_truth
+from torchvts.training.balls import Truth
 from torchvts.training.presses import Training
 
 from . import rows as records
@@ -24,7 +22,7 @@ from .drawn_sensors import DrawnPress, drawn_sensor
 from .metrics import normal_angle_deg
 from .random_scenes import random_frame
 from .rows import Column, Row, error_column
-from .sets import Target, from_folder, load, truth_of
+from .sets import Target, load, truth_of
 
 LEVELS = (0.5, 0.68, 0.8, 0.9, 0.95)
 """Probabilities at which coverage is measured."""
@@ -71,38 +69,6 @@ def of_scenes(seeds: Sequence[int], unit: str | None = None, progress: bool = Fa
             truth = Truth(frame.scene.depth_mm, frame.scene.gradient, out.contact | frame.scene.contact)
             rows.append(coverage(out, truth, pipe.confidence.spread, frame.unit, frame.shape))
     return rows
-
-
-def of_presses(
-    folder: str | Path, sensor: Sensor, *, learn: bool = True, mode: str = "precise", progress: bool = False
-) -> list[Row]:
-    """Coverage inside the contact of presses that the calibration has not seen.
-
-    Labels give the place of a ball, not its depth, so only the relief is compared: depth and ball each less their own mean.
-
-    Args:
-        folder: presses in gs_sdk's layout, with labels.
-        sensor: the sensor; its prior is used if it has one.
-        learn: calibrate by the presses of the other folds; else by the background and the prior.
-        mode: "fast" or "precise".
-        progress: show a bar.
-    Raises:
-        ValueError: no press can be scored.
-    """
-    data, rows = from_folder(folder, sensor), []
-    for fold in tqdm(data.folds, desc="presses", disable=not progress or None, leave=False):
-        unit = Training(data.background, fold.learned if learn else (), sensor).calibration
-        pipe = ConfidentPipeline.from_calibration(unit, mode)
-        for target in fold.scored:
-            if target.ball is not None:
-                rows.append(of_press(pipe(target.image[None]), target.ball, sensor.mm_per_pixel, pipe.confidence.spread))
-    return rows
-
-
-def of_press(out: ConfidentOutput, press: Press, mm_per_pixel: float, spread: float) -> Row:
-    """Coverage of one labelled press inside its contact; of the depth only the relief is compared."""
-    ball = ball_truth(press, out.depth_mm.shape[2], out.depth_mm.shape[3], mm_per_pixel)
-    return coverage(out, ball, spread, press.name, "ball", relief=True)
 
 
 def mean(rows: Sequence[Row], name: str = "") -> Row:

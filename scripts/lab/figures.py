@@ -219,23 +219,18 @@ def _relief_error(depth_mm: Tensor, truth: Truth | None) -> Tensor:
 # coverage of confidence
 
 
-def coverage_figure(curves: Sequence[Row]) -> Figure:
-    """Measured against stated shares with the quartiles over frames, and on one random scene the bounds beside the errors.
-
-    More than five curves cannot be distinguished.
-    """
+def coverage_figure(curve: Row) -> Figure:
+    """Measured against stated shares with the quartiles over frames, and on one random scene the bounds beside the errors."""
     figure = new_figure(10.0, 6.4, 110)
     parts = figure.subfigures(2, 1, height_ratios=[1.7, 1.0], squeeze=False)
     panels = list(parts[0, 0].subplots(1, 2, sharey=True))
     for panel, what in zip(panels, ("normal", "depth")):
         panel.fill_between([45, 100], [40, 95], [50, 105], color="0.9", label="within 5 points")
         panel.plot([45, 100], [45, 100], color="0.5", linewidth=1.0)
-        for k, (curve, (color, marker)) in enumerate(zip(curves, _LINES)):
-            levels = [100.0 * level + 0.5 * (k - 0.5 * (len(curves) - 1)) for level in LEVELS]  # so that bars stand side by side
-            ends = ("", ", lower quartile", ", upper quartile")
-            shares, low, high = ([curve.errors[f"{what} {level:.0%}{end}"] for level in LEVELS] for end in ends)
-            panel.plot(levels, shares, marker=marker, color=color, markersize=4, lw=1.4, label=curve.data)
-            panel.vlines(levels, low, high, color=color, lw=1.2, alpha=0.6)
+        levels, ends = [100.0 * level for level in LEVELS], ("", ", lower quartile", ", upper quartile")
+        shares, low, high = ([curve.errors[f"{what} {level:.0%}{end}"] for level in LEVELS] for end in ends)
+        panel.plot(levels, shares, marker="o", color=OURS, markersize=4, lw=1.4, label=curve.data)
+        panel.vlines(levels, low, high, color=OURS, lw=1.2, alpha=0.6)
         panel.set(xlim=(46, 99), ylim=(30, 101.5), xlabel="stated share of pixels, %", title=f"{what} within its bound")
         panel.grid(alpha=0.3)
     panels[0].set_ylabel("measured share of pixels, %")

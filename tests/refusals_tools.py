@@ -112,9 +112,9 @@ TABLE = {
     # ---- stream ----
     "stream.FrameCheck": Entry({"background": image()}, {"background": [b for k, b in enumerate(images()) if k not in (3, 4)]}),
     "stream.Recording": Entry({"calibration": unit(), "mode": "fast", "first": None, "stage": nullcontext}
-        | {"network": None, "device": "cpu", "contact": None, "codec": ""},
+        | {"network": None, "device": "cpu", "contact": None},
         {"calibration": [None, "unit"], "mode": ["slow"], "first": [], "stage": []}
-        | {"network": [], "device": [None, "gpu", "cuda:99"], "contact": ["4.5", 4.5], "codec": []}),
+        | {"network": [], "device": [None, "gpu", "cuda:99"], "contact": ["4.5", 4.5]}),
     "stream.StreamReport": Entry({"stream": ...}, {"stream": [None, "camera"]}, run=False),
     "stream.TactileStream": Entry({"source": ..., "sensor_or_calibration": sensor(), "mode": "fast", "background_frames": 12,
         "presses": (), "network": None, "device": "cpu", "reconnect_s": 0.0, "contact": None, "record": None,
@@ -132,7 +132,7 @@ TABLE = {
     **dict.fromkeys(("frames", "stream.frames"), Entry(
         {"source": ...}, {"source": ["no/such.mp4", ".", None, 2.5, True, -1, 2**31, 10**400, "9" * 20, "\u00b2"]}, run=False)),
     "stream.find_background": Entry(
-        {"images": image()[None].expand(5, -1, -1, -1), "sensor": None, "codec": ""},
-        {"images": [*batches(3), image()[None]], "sensor": [], "codec": []}
+        {"images": image()[None].expand(5, -1, -1, -1), "sensor": None},
+        {"images": [*batches(3), image()[None]], "sensor": []}
         ),
 }

@@ -90,7 +90,7 @@ def by_hand(arguments: argparse.Namespace, picture: Path) -> int:
     try:
         sensor = sensor_of(arguments, lambda: camera.readable[0].shape[:2])
         session = Session(arguments.session or arguments.out.with_name(f"{arguments.out.stem}_presses"), sensor)
-        guide = Guide(session, Watch(sensor, getattr(camera.reader, "codec", "")), ball_mm, until_deg, picture, arguments.force)
+        guide = Guide(session, Watch(sensor), ball_mm, until_deg, picture, arguments.force)
         lost = None if guide.reached else play(camera, guide.add)
     finally:
         camera.close()

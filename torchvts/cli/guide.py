@@ -94,11 +94,10 @@ class Watch:
 
     Args:
         sensor: rectifies.
-        codec: of a film, see :func:`torchvts.stream.find_background`.
     """
 
-    def __init__(self, sensor: Sensor, codec: str = "") -> None:
-        self.sensor, self.codec = sensor, codec
+    def __init__(self, sensor: Sensor) -> None:
+        self.sensor = sensor
         self._rectified: deque[Tensor] = deque(maxlen=FIRST_FRAMES)
         self._raw: deque[Pixels] = deque(maxlen=FIRST_FRAMES if sensor.cuts_a_place else 0)
 
@@ -112,7 +111,7 @@ class Watch:
         if len(self._rectified) < FIRST_FRAMES:
             return True
         try:
-            check_steady(torch.stack(list(self._rectified)), self.codec)
+            check_steady(torch.stack(list(self._rectified)))
         except ValueError:
             return True
         return False
@@ -124,7 +123,7 @@ class Watch:
         if self.moves():
             return "something moves, or the light changes: keep the sensor still, and off everything"
         try:
-            find_background(torch.stack(list(self._rectified)), self.sensor, self.codec)
+            find_background(torch.stack(list(self._rectified)), self.sensor)
         except ValueError:
             return f"something touches the skin, or this is no sensor '{self.sensor.name}': lift everything off it"
         return ""

@@ -18,7 +18,7 @@ from .files import (
     natural_order,
     read_pixels,
 )
-from .videos import ASSUMED_FPS, frames_a_second, lossy_codec, open_video, video_reads
+from .videos import ASSUMED_FPS, frames_a_second, open_video, video_reads
 
 PAGES = 16
 """Pages of a TIFF that are decoded at once."""
@@ -131,15 +131,3 @@ def video_rate(path: Path) -> float:
         return frames_a_second(capture)
     finally:
         capture.release()
-
-
-def video_codec(path: Path) -> str:
-    """:func:`lossy_codec` of a video file; "JPEG" of such an image or a folder of them."""
-    if path.suffix.lower() in VIDEO_SUFFIXES and not path.is_dir():
-        capture = open_video(path)
-        try:
-            return lossy_codec(capture)
-        finally:
-            capture.release()
-    first = next(iter(image_files(path)), path) if path.is_dir() else path
-    return "JPEG" if first.suffix.lower() in (".jpg", ".jpeg") else ""

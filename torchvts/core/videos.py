@@ -1,4 +1,4 @@
-"""Video files by OpenCV: their frames in order, their rate and their codec."""
+"""Video files by OpenCV: their frames in order, and their rate."""
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -51,22 +51,3 @@ def frames_a_second(capture: Any) -> float:
 
     fps = float(capture.get(cv2.CAP_PROP_FPS))
     return fps if 0.5 <= fps <= 1000.0 else ASSUMED_FPS
-
-
-CODECS = {
-    **dict.fromkeys(("FMP4", "mp4v", "XVID", "DIVX", "DX50", "MP42", "MP43"), "MPEG-4"),
-    **dict.fromkeys(("h264", "H264", "avc1", "X264"), "H.264"),
-    **dict.fromkeys(("hevc", "HEVC", "hvc1", "hev1"), "H.265"),
-    **dict.fromkeys(("MJPG", "mjpg"), "Motion JPEG"),
-    **dict.fromkeys(("FFV1", "HFYU", "FFVH", "MPNG", "png ", "I420", "YUY2", "YUYV", "\0\0\0\0"), ""),
-}
-"""OpenCV's codes of codecs, and the names of those that lose something; others are shown by their code."""
-
-
-def lossy_codec(capture: Any) -> str:
-    """Name of the codec of an OpenCV capture; empty where it loses nothing, or is not known."""
-    import cv2
-
-    code = int(capture.get(cv2.CAP_PROP_FOURCC))
-    letters = max(code, 0).to_bytes(8, "little")[:4].decode("latin-1")
-    return CODECS.get(letters, letters)

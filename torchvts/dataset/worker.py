@@ -19,7 +19,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from ..core.checks import in_one_line
-from ..core.recordings import count_frames, cut_short, video_codec
+from ..core.recordings import count_frames, cut_short
 from ..model import Calibration
 from ..pipeline import DepthOutput
 from ..skin import ContactSettings, motion_of_unit
@@ -139,7 +139,7 @@ class Worker:
         try:
             if 0 < count <= len(held):
                 first = torch.cat([image for _, image in held])
-                return self.recording(first, codec=video_codec(item.file))
+                return self.recording(first)
             reason = f"background_frames: expected at least {count} frames, got {len(held)}" if count > 0 else ""
         except ValueError as error:
             reason = in_one_line(error)

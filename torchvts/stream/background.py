@@ -17,7 +17,7 @@ from ..calibration import (
 from ..core.blur import band_of_ratios, without_margin
 from ..core.cells import whole_cell_means
 from ..core.checks import check_batch, check_image, check_integer, check_path, check_positive, check_sequence, parse_number
-from ..core.recordings import is_film, video_codec
+from ..core.recordings import is_film
 from ..model import Calibration, Sensor, SensorPrior, check_calibration, check_sensor
 from ..model.calibration import PEDESTAL
 from ..normals import NormalFromResponse
@@ -25,9 +25,6 @@ from .sources import frames
 
 MOVED = 0.02
 """Relative change of a cell of 1/20 of the frame that counts as movement among the first frames."""
-
-BLOCKS = 4.0 / 255.0
-"""Cells of undeformed skin change by less in videos by MPEG-4, Motion JPEG, FLV1 (up to 3.1 of 255 on three units)."""
 
 TOUCHED = 0.06
 """Relative change of three cells of 1/20 of the frame from which something touches the skin: presses of five sensors have 0.15 and
@@ -42,7 +39,7 @@ WITHOUT_FIRST = (
 """What to do where the first frames show contact."""
 
 
-def find_background(images: Tensor, sensor: Sensor | None = None, codec: str = "") -> Tensor:
+def find_background(images: Tensor, sensor: Sensor | None = None) -> Tensor:
     """Find the image of the skin without contact in the first frames, or refuse and say why.
 
     The image is the median over the frames, averaged with the half of the values next to it. The frames are divided into cells of
@@ -63,7 +60,6 @@ def find_background(images: Tensor, sensor: Sensor | None = None, codec: str = "
     Args:
         images: (N, 3, H, W) in [0, 1], rectified, at least 3.
         sensor: of the images; its prior is used if it has one.
-        codec: of the video they are from, named where small changes look like its blocks; empty where it loses nothing.
     Returns:
         The image (3, H, W) in steps of 1/65535, which a calibration file keeps.
     Raises:
@@ -77,7 +73,7 @@ def find_background(images: Tensor, sensor: Sensor | None = None, codec: str = "
             f"images: expected at least 3 frames without contact, got {images.shape[0]}: the source is too short, or fewer were "
             "asked for (background_frames, --background-frames; 0 keeps a calibration's)"
         )
-    check_steady(images, codec)
+    check_steady(images)
     rank = images.sort(0).values
     quarter = len(images) // 4
     image = _in_16_bits(rank[quarter : len(images) - quarter].mean(0))
@@ -155,7 +151,7 @@ def _background_of_video(path: Path, sensor: Sensor, first_frames: int) -> Tenso
         first = [sensor.rectify(image[None]).clamp(0.0, 1.0) for _, image in islice(frames(path), first_frames)]
         if len(first) < first_frames:
             raise ValueError(f"background: expected at least {first_frames} frames, got {len(first)}: ask for fewer")
-        return find_background(torch.cat(first), sensor, video_codec(path))
+        return find_background(torch.cat(first), sensor)
     except ValueError as error:
         raise ValueError(str(error) if str(error).startswith(str(path)) else f"{path}: {error}") from error
 
@@ -194,7 +190,7 @@ def _cells(images: Tensor) -> Tensor:
     return whole_cell_means(images, side).double() + PEDESTAL
 
 
-def check_steady(images: Tensor, codec: str = "") -> None:
+def check_steady(images: Tensor) -> None:
     """Raise ValueError where the light changes or something moves in frames (N, 3, H, W); as :func:`find_background`."""
     cells = _cells(images)
     ratio = cells / cells.median(0, keepdim=True).values
@@ -214,18 +210,13 @@ def check_steady(images: Tensor, codec: str = "") -> None:
     moved = moves.flatten(1).sum(1)
     if int(moved.max()) < 3:
         return
-    where = (
+    most = 255.0 * float((cells - cells.median(0, keepdim=True).values).abs().amax(1)[moves].max())
+    raise ValueError(
         f"background: frame {int(moved.argmax())} of the first {len(images)} differs from the others in {int(moved.max())} of "
-        f"{difference[0, 0].numel()} places"
+        f"{difference[0, 0].numel()} places, by at most {most:.1f} of 255: a contact, or the sensor moves: start without contact, "
+        "or take fewer frames; up to 4 of 255 may be blocks of a lossy video, which hide faint contacts: record without loss "
+        "(--record raw.mkv, or PNG), or use a calibration's background (--background-frames 0; background_frames=0)"
     )
-    most = float((cells - cells.median(0, keepdim=True).values).abs().amax(1)[moves].max())
-    if codec and most < BLOCKS:
-        raise ValueError(
-            f"{where}, by at most {255.0 * most:.1f} of 255: blocks of the video's codec, {codec}, do that, and hide faint "
-            "contacts; record without loss (--record raw.mkv, or PNG), or use the background of a calibration (--calibration with "
-            "--background-frames 0; background_frames=0)"
-        )
-    raise ValueError(f"{where}: a contact, or the sensor moves; start without contact, or take fewer frames")
 
 
 def with_background(calibration: Calibration, background: Tensor) -> Calibration:

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 from ..core.checks import check_integer, check_positive
 from ..core.files import Pixels, check_text_name
-from ..core.videos import frames_a_second, lossy_codec
+from ..core.videos import frames_a_second
 from .devices import found_cameras
 
 
@@ -70,7 +70,7 @@ class Camera:
         except BaseException:
             self.close()
             raise
-        self.fps, self.codec = frames_a_second(self._capture), lossy_codec(self._capture)
+        self.fps = frames_a_second(self._capture)
 
     def read(self) -> Pixels | None:
         there, pixels = self._capture.read()

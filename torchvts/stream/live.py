@@ -116,13 +116,10 @@ class TactileStream:
         self._zero_missing = 0
         self._frames = SourceFrames(_reader_of(source, reconnect_s, record, settings), background_frames, realtime, self.stages)
         self._size = self._frames.readable[0].shape[:2]
-        self._codec: str = getattr(self.reader, "codec", "")
-        self._begin = partial(
-            Recording, mode=mode, network=network, device=device, contact=contact, codec=self._codec, stage=self.stages.stage
-        )
+        self._begin = partial(Recording, mode=mode, network=network, device=device, contact=contact, stage=self.stages.stage)
         try:
             first = torch.cat([self._rectified(pixels) for pixels in self._frames.readable])
-            self.calibration = _calibrated(first, sensor_or_calibration, presses, self._codec)
+            self.calibration = _calibrated(first, sensor_or_calibration, presses)
             self.recording = self._begin(self.calibration, first=first if background_frames > 0 else None)
         except BaseException as error:
             self.close()
@@ -156,7 +153,7 @@ class TactileStream:
         first = torch.cat(self._zero)
         self._zero = []
         try:
-            background = find_background(first, self.calibration.sensor, self._codec).clamp(0.0, 1.0)
+            background = find_background(first, self.calibration.sensor).clamp(0.0, 1.0)
             calibration = with_background(self.calibration, background)
             self.recording, self.calibration = self._begin(calibration, first=first), calibration
         except ValueError as error:
@@ -249,11 +246,11 @@ def _sensor_of(unit: Sensor | Calibration, background_frames: int, presses: Sequ
     return unit.sensor
 
 
-def _calibrated(first: Tensor, unit: Sensor | Calibration, presses: Sequence[Press], codec: str) -> Calibration:
+def _calibrated(first: Tensor, unit: Sensor | Calibration, presses: Sequence[Press]) -> Calibration:
     """The calibration that was given, or that of the first frames, whose doubts it holds itself."""
     if isinstance(unit, Calibration):
         return unit
-    background = find_background(first, unit, codec).clamp(0.0, 1.0)
+    background = find_background(first, unit).clamp(0.0, 1.0)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", CalibrationWarning)
         return calibrate(background, unit, presses)

@@ -38,7 +38,6 @@ class Recorder:
 
     def __init__(self, reader: Reader, path: str | Path) -> None:
         self.name, self.fps, self.path = reader.name, reader.fps, check_path("record", path)
-        self.codec = getattr(reader, "codec", "")
         self.times: list[float] = []
         self._reader, self._lock, self._closed, self._settling = reader, threading.Lock(), False, SETTLING
         self._start = self._clock = 0.0

@@ -74,7 +74,6 @@ class Recording:
         network: a trained network in place of the calibration's model, see :func:`torchvts.pipeline.unit_pipeline`.
         device: of the pipeline, "cpu" or "cuda"; frames come and go on the CPU.
         contact: thresholds of contact; None for the usual ones.
-        codec: of the video, see :func:`find_background`.
         stage: makes a context in which a stage of that name runs, to measure its time.
     Attributes:
         pipe: the pipeline, frozen.
@@ -93,7 +92,6 @@ class Recording:
         network: str | Path | None = None,
         device: str = "cpu",
         contact: ContactSettings | None = None,
-        codec: str = "",
         stage: Callable[[str], AbstractContextManager[Any]] = lambda name: nullcontext(),
     ) -> None:
         check_calibration("calibration", calibration)
@@ -103,7 +101,7 @@ class Recording:
         self._stage = stage
         self.conditions: Conditions | None = None
         self.doubt = ""
-        image = None if first is None else find_background(first, codec=codec)
+        image = None if first is None else find_background(first)
         if first is not None:
             _learn_unrest(pipe, first)
         self._usual_deg = usual_unseen_deg(calibration, pipe)

@@ -20,7 +20,6 @@ from ..core.recordings import (
     cut_short,
     image_files,
     raw_frames,
-    video_codec,
     video_rate,
 )
 from .cameras import AS_IT_IS, Camera, CameraSettings
@@ -107,7 +106,7 @@ class LiveReader:
         self._closed = threading.Event()
         self._open, self._sleep = open_reader, sleep or self._closed.wait
         reader = open_reader()
-        self.name, self.fps, self.codec = reader.name, reader.fps, getattr(reader, "codec", "")
+        self.name, self.fps = reader.name, reader.fps
         self._worker = _ReadingThread(reader)
 
     def read(self) -> Pixels | Unreadable | None:
@@ -250,7 +249,7 @@ class FileReader:
         self._frames: Iterator[RawFrame] = chain((first,), frames)
         names = [file.stem for file in image_files(path)] if path.is_dir() else list(known)
         self.times = [known[name] for name in names] if all(name in known for name in names) else []
-        self.fps, self.codec = rate_of(self.times, video_rate(path)), video_codec(path)
+        self.fps = rate_of(self.times, video_rate(path))
         self.fps_assumed = not self.times and path.suffix.lower() not in VIDEO_SUFFIXES
 
     def read(self) -> Pixels | Unreadable | None:

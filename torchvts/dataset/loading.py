@@ -30,7 +30,6 @@ class Entry(NamedTuple):
         done: whether its result is there.
         failed: why it cannot be used; empty where it can.
         length: the number of frames of a video, in an entry of its own at the end; None in all others.
-        mine: whether its depth is this rank's to find. Other frames of a video are there because they are its first.
         doubt: why less may have been seen in it than is there; empty for nothing.
     """
 
@@ -39,7 +38,6 @@ class Entry(NamedTuple):
     done: bool = False
     failed: str = ""
     length: int | None = None
-    mine: bool = True
     doubt: str = ""
 
 
@@ -49,7 +47,7 @@ Batch = tuple[list[tuple[Entry, bool]], Array]
 
 
 def load_frames(records: Records, sensor: Sensor, share: tuple[int, int], workers: int) -> Iterator[tuple[Entry, Tensor | None]]:
-    """The images of one rank's share and the first frames of videos, each with its image (1, 3, H, W), rectified, if it has one.
+    """The frames of one rank's share, each with its image (1, 3, H, W), rectified, if it has one.
 
     Args:
         records: of the run: which source it reads and which frames are done.
@@ -131,10 +129,9 @@ class _Frames(IterableDataset[Batch]):
         number = 0
         try:
             for number, frame in enumerate(raw_frames(item.file)):
-                mine = number % every == 0 and number // every % world == rank
-                if mine or number < self.records.settings.background_frames:
-                    done = mine and self.records.is_done(item, number)
-                    yield Entry(item, number, done, mine=mine), frame.read
+                if number % every == 0 and number // every % world == rank:
+                    done = self.records.is_done(item, number)
+                    yield Entry(item, number, done), None if done else frame.read
         except ValueError as error:  # its name, or no frame
             yield Entry(item, failed=in_one_line(error)), None
         else:

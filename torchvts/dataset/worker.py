@@ -1,7 +1,7 @@
 """One process's share of a data set: read, reconstruct, write.
 
-Frames of a video go the way of a stream (:class:`torchvts.stream.Recording`): every process reads the first ones, and finds the
-depth of its own. An image is a recording of one frame.
+Frames of a video go the way of a stream (:class:`torchvts.stream.Recording`): every process begins it by the first ones, and finds
+the depth of its own. An image is a recording of one frame.
 """
 
 import os
@@ -11,6 +11,7 @@ from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,7 +20,8 @@ from torch import Tensor
 from tqdm import tqdm
 
 from ..core.checks import in_one_line
-from ..core.recordings import count_frames, cut_short
+from ..core.files import rgb_from_bgr
+from ..core.recordings import count_frames, cut_short, raw_frames
 from ..model import Calibration
 from ..pipeline import DepthOutput
 from ..skin import ContactSettings, motion_of_unit
@@ -108,55 +110,46 @@ class Worker:
         return RunReport(0, rows, rows - done, failed, seconds, self.notes, doubted)
 
     def _depths(self, loaded: Iterable[tuple[Entry, Tensor | None]]) -> Iterator[_Reconstructed]:
-        """The frames of this rank with image and depth; those of a video once its first frames are there."""
-        recording: Recording | None = None
-        held: list[tuple[Entry, Tensor]] = []
-        video: Item | None = None
+        """The frames of this rank with image and depth."""
+        recording, of_video = self.image, None
         for frame, image in loaded:
-            if not frame.item.is_film or (image is None and frame.length is None):
-                if frame.mine:
-                    yield self._depth(self.image, frame, image)
-                continue
-            if frame.item != video:
-                video, recording, held = frame.item, None, []
-            if image is not None:
-                held.append((frame, image))
-            if recording is None and (frame.length is not None or len(held) >= self.settings.background_frames):
-                recording = self._recording(frame.item, held)
-            if recording is not None:
-                for one, of_video in held:
-                    if one.mine:
-                        yield self._depth(recording, one, of_video)
-                held = []
-            if frame.length is not None:
-                if text := cut_short(frame.item.file, frame.length):
-                    self.notes.append((frame.item.path, text))
+            if frame.length is not None and (text := cut_short(frame.item.file, frame.length)):
+                self.notes.append((frame.item.path, text))
+            if image is None:
                 yield frame, None, None
+                continue
+            if frame.item.is_film and frame.item != of_video:  # images may come between its frames
+                of_video, recording = frame.item, self._recording(frame.item)
+            yield self._depth(recording if frame.item.is_film else self.image, frame, image)
 
-    def _recording(self, item: Item, held: Sequence[tuple[Entry, Tensor]]) -> Recording:
-        """The recording of a video that begins with these frames."""
+    def _recording(self, item: Item) -> Recording:
+        """The recording of a video, by its first frames that can be read."""
         count = self.settings.background_frames
         try:
-            if 0 < count <= len(held):
-                first = torch.cat([image for _, image in held])
-                return self.recording(first)
-            reason = f"background_frames: expected at least {count} frames, got {len(held)}" if count > 0 else ""
+            first = list(islice(self._readable(item), count))
+            if 0 < count <= len(first):
+                return self.recording(torch.cat(first))
+            reason = f"background_frames: expected at least {count} frames, got {len(first)}" if count > 0 else ""
         except ValueError as error:
             reason = in_one_line(error)
         if reason:
             self.notes.append((item.path, f"first frames not used, the calibration is used as it is: {reason}"))
         return self.recording()
 
-    def _depth(self, recording: Recording, frame: Entry, image: Tensor | None) -> _Reconstructed:
-        """Depth of one frame if it is wanted, or why there is none."""
-        if image is None:
-            return frame, None, None
+    def _readable(self, item: Item) -> Iterator[Tensor]:
+        """The frames (1, 3, H, W) of a video that can be read, rectified."""
+        for frame in raw_frames(item.file):
+            try:
+                yield self.sensor.rectify(rgb_from_bgr(frame.read())[None]).clamp(0.0, 1.0)
+            except (OSError, ValueError):  # said where its depth is wanted
+                continue
+
+    def _depth(self, recording: Recording, frame: Entry, image: Tensor) -> _Reconstructed:
+        """Depth of one frame, or why there is none."""
         try:
             reason = recording.unusable(image)
             if reason:
                 return frame._replace(failed=reason), None, None
-            if frame.done:
-                return frame, None, None
             output = recording(image)
             return frame._replace(doubt=recording.doubt), image, output
         except ValueError as error:

@@ -166,7 +166,7 @@ TABLE = {
     **{name: Entry({"mm_per_pixel": 1.0}, {}) for name in ("AdaptiveIntegration", "PoissonDCT", "PoissonDST", "PoissonBackground")},
     "PerspectiveIntegration": Entry({"mm_per_pixel": 1.0, "camera_height_mm": 30.0, "integrate": vts.PoissonBackground()},
         {"camera_height_mm": NUMBER, "integrate": ["dct", 3]}),
-    "PerspectiveIntegration.forward": Entry({"gradient": GRADIENT, **KNOWN}, BAD_KNOWN, lambda: PerspectiveIntegration(1.0, 30.0)),
+    "PerspectiveIntegration.forward": Entry({"gradient": GRADIENT}, {}, lambda: PerspectiveIntegration(1.0, 30.0)),
     "Confidence": Entry({"normals": pipe().normals, "noise_std": 0.01 * FLAT, "image_noise_std": torch.full((3,), 0.01),
         "error": 0.01 * FLAT, "mm_per_pixel": 1.0}, {"normals": ["lights", None], "noise_std": BAD_FLAT,
         "image_noise_std": [torch.zeros(2), None, 0.01], "error": [FLAT[None], None, 0.01],
@@ -192,7 +192,7 @@ TABLE = {
         "background": [bad for bad in images() if bad is not None and not of_other_size(bad)],
         "image": [bad for bad in images() if not of_other_size(bad)]}),
     "PoissonDST.forward": Entry({"gradient": GRADIENT}, {"gradient": batches(2)}, lambda: vts.PoissonDST()),
-    **{f"{name}.forward": Entry({"gradient": GRADIENT, **KNOWN}, BAD_KNOWN, lambda name=name: integrator(name)())
+    **{f"{name}.forward": Entry({"gradient": GRADIENT}, {}, lambda name=name: integrator(name)())
         for name in ("PoissonBackground", "PoissonDCT")},
     "AdaptiveIntegration.forward": Entry({"gradient": GRADIENT}, {}, lambda: vts.AdaptiveIntegration()),
     "Press": Entry(

@@ -143,12 +143,6 @@ UP = torch.tensor([0.0, 0.0, 1.0]).reshape(1, 3, 1, 1).expand(1, 3, HEIGHT, WIDT
 OUT = vts.DepthOutput(DEPTH, torch.zeros(1, 2, HEIGHT, WIDTH), UP, DEPTH > 0, DEPTH > 0)
 GRADIENT = torch.zeros(1, 2, 8, 8)
 BAD_GRADIENT = [*batches(2), torch.zeros(1, 2, 1, 8)]
-BAD_WEIGHTS = [torch.ones(1, 1, 4, 4), torch.ones(8, 8), torch.ones(1, 1, 8, 8).bool(), "all", np.ones((1, 1, 8, 8))]
-KNOWN = {name: torch.ones(1, 1, 8, 8) for name in ("known_mm", "known_weight")}
-BAD_KNOWN = {
-    "known_mm": [*BAD_WEIGHTS, KNOWN["known_mm"] + NAN],
-    "known_weight": [*BAD_WEIGHTS, KNOWN["known_weight"] - 2.0, KNOWN["known_weight"] + INF],
-}
 COMMON = {"height": INTEGER, "width": INTEGER, "mm_per_pixel": NUMBER, "sensor": SENSOR, "calibration": OTHERS}
 COMMON |= {"gradient": BAD_GRADIENT, "initial": BAD_POSE, "rectify": [sensor(), "digit", vts.Rectify(vts.Sensor.load("digit"))]}
 """What an argument of this name refuses where its entry says nothing else."""

@@ -74,6 +74,18 @@ def test_backgrounds_of_the_type_are_not_named_and_turned_ones_are(data, mini):
         assert "it has its channels swapped to the order B, G, R (" in of_type(image.flip(0), mini)[0].text
 
 
+@pytest.mark.parametrize("place", [0, 12])
+def test_images_that_are_all_swapped_are_doubted_for_that_alone(data, mini, place):
+    background, presses = vts.read_presses(data / "gelsight_mini_a")
+    press = dataclasses.replace(presses[place], image=presses[place].image.flip(0), center_px=None, contact_radius_px=None)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        calibration = vts.calibrate(background.flip(0), mini, [press])
+    (doubt,) = calibration.report["doubts"]
+    assert "it has its channels swapped to the order B, G, R (" in doubt and [str(one.message) for one in caught] == [doubt]
+    assert not calibration.metric
+
+
 @pytest.mark.parametrize("folder", ["gelsight_pale", "digit_a"])
 def test_another_sensor_under_the_prior_of_a_mini_is_named(data, mini, folder):
     image = vts.read_image(data / folder / "background.png")

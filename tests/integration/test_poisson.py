@@ -11,8 +11,6 @@ import torch
 import torchvts as vts
 from lab import metrics
 from torchvts.integration import PerspectiveIntegration, divergence
-from torchvts.integration.poisson import plan_dct
-from torchvts.integration.screened import solve_screened
 
 SIZES = [(3, 3), (4, 4), (5, 8), (8, 5), (7, 11), (13, 13), (12, 10), (3, 16), (15, 14), (9, 6)]
 both_ways = pytest.mark.parametrize("size", [(11, 13), (9, 14)], ids=["prime and odd", "small factors"])
@@ -149,78 +147,6 @@ MODULES = (vts.PoissonDCT(0.3), vts.PoissonBackground(0.3), vts.AdaptiveIntegrat
 def test_a_batch_of_none_is_integrated(solver):
     gradient = torch.zeros(0, 2, 9, 12, requires_grad=True)
     assert solver(gradient).shape == (0, 1, 9, 12)
-
-
-def tilted(height=24, width=31, pitch=0.2):
-    """A surface whose edges have exactly the mean slope of their pixels, and its slopes."""
-    y, x = torch.meshgrid(torch.arange(height, dtype=torch.float64), torch.arange(width, dtype=torch.float64), indexing="ij")
-    x, y = pitch * x, pitch * y
-    depth = 0.7 + 0.02 * (x - 2) ** 2 - 0.015 * (y - 1) ** 2 + 0.01 * x * y
-    return depth[None, None], torch.stack((0.04 * (x - 2) + 0.01 * y, 0.01 * x - 0.03 * (y - 1)))[None]
-
-
-def known_at(*places, weight=1.0):
-    found = torch.zeros(1, 1, 24, 31, dtype=torch.float64)
-    for row, column in places:
-        found[0, 0, row, column] = weight
-    return found
-
-
-KNOWN_AT = {
-    "all alike": torch.full((1, 1, 1, 1), 2.0, dtype=torch.float64),
-    "a pixel": known_at((3, 4)),
-    "two fixed pixels": known_at((3, 4), (20, 9), weight=1e6),
-    "a fixed half": (torch.arange(31) < 15).double().expand(1, 1, 24, 31) * 1e6,
-}
-
-
-@pytest.mark.parametrize("case", KNOWN_AT)
-@pytest.mark.parametrize("kind", [vts.PoissonDCT, vts.PoissonBackground])
-def test_known_depth_that_agrees_gives_the_height_and_changes_no_slope(kind, case):
-    depth, gradient = tilted()
-    found = kind(0.2)(gradient, depth * (KNOWN_AT[case] > 0), KNOWN_AT[case])
-    assert float((found - depth).abs().max()) < 1e-6
-    scripted = torch.jit.script(kind(0.2))(gradient, depth * (KNOWN_AT[case] > 0), KNOWN_AT[case])
-    assert torch.equal(scripted, found)
-
-
-def test_known_depth_and_slopes_that_disagree_are_weighed_by_least_squares():
-    pitch, random = 0.3, torch.Generator().manual_seed(5)
-    gradient, known = random_gradient(6, 7), torch.randn(1, 1, 6, 7, generator=random, dtype=torch.float64)
-    for weight in (torch.rand(1, 1, 6, 7, generator=random, dtype=torch.float64), torch.full((1, 1, 1, 1), 3.0).double()):
-        found = vts.PoissonDCT(pitch)(gradient, known, weight).requires_grad_(True)
-        energy = (weight * (found - known).square()).sum()
-        for axis, dim in ((0, 3), (1, 2)):
-            slope = gradient[:, axis : axis + 1]
-            mean = 0.5 * (slope.narrow(dim, 1, slope.shape[dim] - 1) + slope.narrow(dim, 0, slope.shape[dim] - 1))
-            energy = energy + (found.diff(dim=dim) / pitch - mean).square().sum()
-        (steepest,) = torch.autograd.grad(energy, found)
-        assert float(steepest.abs().max()) < 1e-7  # of the minimum
-
-
-@pytest.mark.parametrize("weight", [torch.rand(2, 1, 5, 6).double(), torch.rand(2, 1, 1, 1).double()], ids=["map", "uniform"])
-@pytest.mark.parametrize("block", [vts.PoissonDCT(0.5), PerspectiveIntegration(0.5, 30.0)], ids=["flat", "perspective"])
-def test_known_depth_has_derivatives(block, weight):
-    given = (0.1 * random_gradient(5, 6, batch=2), torch.rand(2, 1, 5, 6).double(), weight.clone())
-    assert torch.autograd.gradcheck(block, tuple(value.requires_grad_(True) for value in given))
-
-
-def test_known_depth_that_does_not_settle_is_told():
-    depth, gradient = tilted()
-    right, pull = 0.2 * divergence(gradient), 0.04 * KNOWN_AT["a fixed half"]
-    with pytest.warns(UserWarning, match="known_weight: the depth of 1 of 1 frames has not settled in 3 steps"):
-        solve_screened(right, pull, depth, plan_dct(gradient, 24, 31), 1e-10, max_iterations=3)
-
-
-def test_known_depth_seen_by_a_pinhole_keeps_its_height():
-    block = PerspectiveIntegration(0.2, 30.0)
-    flat, known = torch.zeros(1, 2, 24, 31, dtype=torch.float64), torch.full((1, 1, 24, 31), 1.5, dtype=torch.float64)
-    for weight in KNOWN_AT.values():
-        assert torch.jit.script(block)(flat, known, weight) == pytest.approx(1.5, abs=1e-6)
-    with pytest.raises(
-        ValueError, match="known_mm: expected none, got one: only PoissonDCT and PoissonBackground take known depth"
-    ):
-        PerspectiveIntegration(0.2, 30.0, vts.PoissonDST(0.2))(flat, known, KNOWN_AT["a pixel"])
 
 
 def test_sphere_error_is_the_integrators_floor_of_the_paper():

@@ -105,14 +105,19 @@ def _from_presses(given: Given) -> Made:
         ValueError: no press can be used, or contacts are wider than their balls.
     """
     contact = resting.beside_presses(given.background, given.presses)
+    strange = of_type(given.background, given.sensor) if given.sensor.prior is not None else []
     try:
-        made, contacts = _fitted(given)
+        made, contacts = _fitted(given, strange)
     except NoUsablePress as error:
-        if not contact:
+        causes = [contact] * bool(contact) + [doubt.text for doubt in strange]
+        if not causes:
             raise
-        raise ValueError(f"{contact}; {error}") from error
+        raise ValueError("; ".join([*causes, str(error)])) from error
     unit = made.unit
     assert unit.response is not None
+    if strange and "prior_deg" in unit.report:  # whatever presses seem to be by the prior of another view follows from that
+        doubts = [Doubt(contact, True)] * bool(contact) + strange
+        return made._replace(unit=with_contact(unit, given.presses, contacts), doubts=doubts)
     field, pitch_mm = unit.response.field, given.sensor.mm_per_pixel
     width = width_of(field, used(contacts), pitch_mm)
     if width.times > 1.0 + SURE * width.std and not given.force:
@@ -126,17 +131,16 @@ def _from_presses(given: Given) -> Made:
     return made._replace(unit=with_contact(unit, given.presses, contacts), doubts=doubts)
 
 
-def _fitted(given: Given) -> tuple[Made, list[Contact]]:
+def _fitted(given: Given, strange: list[Doubt]) -> tuple[Made, list[Contact]]:
     """The fit from the prior, if there is one; without it where presses or background contradict it, and that is better.
 
     Better is a fit that uses clearly more presses, or else has the lower held-out error. Without a held-out error it is the one
-    from the prior: of one or two presses alone a field knows only their places.
+    from the prior: of one or two presses alone a field knows only their places. ``strange``: what :func:`of_type` says.
     """
     background, sensor, presses, prior = given.background, given.sensor, given.presses, given.sensor.prior
     if prior is None:
         unit, contacts = by_presses(background, sensor, presses, None, given.progress)
         return Made(unit, [], "presses"), contacts
-    strange = of_type(background, sensor)
     on_prior: Calibration | None = None
     try:
         on_prior, contacts = by_presses(background, sensor, presses, prior, given.progress)

@@ -8,16 +8,13 @@ X = u (h - z) / h, Y = v (h - z) / h. With p = dz/dX, q = dz/dY, differentiating
 dw/dv likewise with q. w is depth to first order, zero where z is, and z = h (1 - exp(-w / h)).
 """
 
-from typing import TYPE_CHECKING, Final
-
 import torch
 from torch import Tensor, nn
 
 from ..core.checks import check_positive
 from ..core.geometry import pixel_grid_mm
 from .base import Integrator, as_integrator
-from .poisson import PoissonBackground, PoissonDCT, check_gradient
-from .screened import check_known
+from .poisson import PoissonBackground, check_gradient
 
 LEAST_COSINE = 0.05
 """Of h + p u + q v, relative to h: a surface steeper than that turns away from the camera."""
@@ -57,11 +54,6 @@ class PerspectiveIntegration(Integrator):
     """
 
     poisson = PoissonBackground
-    takes_known: Final[bool]
-
-    if TYPE_CHECKING:
-
-        def __call__(self, gradient: Tensor, known_mm: Tensor | None = None, known_weight: Tensor | None = None) -> Tensor: ...
 
     def __init__(self, mm_per_pixel: float, camera_height_mm: float, integrate: nn.Module | None = None) -> None:
         super().__init__()
@@ -69,30 +61,13 @@ class PerspectiveIntegration(Integrator):
         self.camera_height_mm = check_positive("camera_height_mm", camera_height_mm)
         self.least_facing_mm = LEAST_COSINE * self.camera_height_mm
         self.integrate = self.poisson(mm_per_pixel) if integrate is None else as_integrator(integrate, mm_per_pixel)
-        self.takes_known = isinstance(self.integrate, PoissonDCT)
 
-    def forward(self, gradient: Tensor, known_mm: Tensor | None = None, known_weight: Tensor | None = None) -> Tensor:
-        """Depth in mm, (B, 1, H, W); known depth as :meth:`PoissonDCT.forward` takes it, below the camera's height.
-
-        Raises:
-            ValueError: as there, and known depth for an integrator that takes none. TypeError: as there.
-        """
+    def forward(self, gradient: Tensor) -> Tensor:
         check_gradient(gradient, 2)
         u, v = pixel_grid_mm(gradient.shape[2], gradient.shape[3], self.mm_per_pixel, gradient.dtype, gradient.device)
         h = self.camera_height_mm
         facing = (h + gradient[:, 0:1] * u + gradient[:, 1:2] * v).clamp_min(self.least_facing_mm)
-        seen = gradient * (h / facing)
-        if self.takes_known:
-            if known_mm is not None and known_weight is not None:
-                check_known(gradient, known_mm, known_weight)
-                # dz / dw at what is known, so that its weight is that of z
-                above = (1.0 - known_mm / h).clamp_min(self.least_facing_mm / h)
-                known_mm, known_weight = -h * torch.log(above), known_weight * above.square()
-            w: Tensor = self.integrate(seen, known_mm, known_weight)  # type: ignore[call-arg]
-        else:
-            if known_mm is not None or known_weight is not None:
-                raise ValueError("known_mm: expected none, got one: only PoissonDCT and PoissonBackground take known depth")
-            w = self.integrate(seen)
+        w: Tensor = self.integrate(gradient * (h / facing))
         return -h * torch.expm1(-w / h)
 
     def extra_repr(self) -> str:

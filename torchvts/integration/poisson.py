@@ -5,15 +5,12 @@ five-point Laplacian on the left and the difference of edge gradients on the rig
 exact inverses of one discrete operator.
 """
 
-from typing import TYPE_CHECKING
-
 import torch
 from torch import Tensor, nn
 
 from ..core.checks import check_batch, check_positive, has_memory
 from ..core.precision import widened
 from .base import Integrator
-from .screened import check_known, solve_screened
 from .transforms import cosine_tables, matrices, reordering, sine_basis, solve_by_fft, solve_by_matrices
 
 
@@ -130,21 +127,7 @@ class PoissonDST(Integrator):
 
 
 class PoissonDCT(Integrator):
-    """Module for :func:`poisson_dct`; keeps the tables of the last size, so that a stream of frames makes them once.
-
-    Where depth is known from elsewhere, by touch or by another sensor, the depth minimises
-    ``|grad z - g|^2 + weight (z - known)^2``, summed over the pixels, and counts from the zero of what is known.
-
-    Example:
-        >>> gradient, known = torch.zeros(1, 2, 24, 32), torch.full((1, 1, 24, 32), 0.3)
-        >>> depth = PoissonDCT(0.1)(gradient, known_mm=known, known_weight=torch.ones(1, 1, 1, 1))
-        >>> bool((depth - 0.3).abs().max() < 1e-6)
-        True
-    """
-
-    if TYPE_CHECKING:
-
-        def __call__(self, gradient: Tensor, known_mm: Tensor | None = None, known_weight: Tensor | None = None) -> Tensor: ...
+    """Module for :func:`poisson_dct`; keeps the tables of the last size, so that a stream of frames makes them once."""
 
     def __init__(self, mm_per_pixel: float = 1.0) -> None:
         super().__init__()
@@ -152,38 +135,14 @@ class PoissonDCT(Integrator):
         self.zero_in_background = False
         self._plan: list[Tensor] = plan_dct(torch.zeros(1, dtype=torch.float64), 2, 2)
 
-    def forward(self, gradient: Tensor, known_mm: Tensor | None = None, known_weight: Tensor | None = None) -> Tensor:
-        """Depth in mm, (B, 1, H, W).
-
-        Args:
-            gradient: (B, 2, H, W), (dz/dx, dz/dy), mm per mm.
-            known_mm: (B, 1, H, W), depth that is known from elsewhere, mm; (1, 1, H, W) for all frames. Needs ``known_weight``.
-            known_weight: how much it counts, at least 0, per mm^2: slopes are followed over lengths below 1 / sqrt(weight), in
-                mm, known depth over longer ones. (B, 1, 1, 1), or (1, 1, 1, 1), for all pixels costs nothing; a map,
-                (B, 1, H, W), 0 where nothing is known, 1e6 where depth is fixed, takes 0.1 s for some pixels of 320 x 240 and
-                3 s for half of them, and warns where its steps did not suffice, as for half of 640 x 480.
-        Raises:
-            ValueError: other shapes, H or W below 2, known depth without weight, negative weights, values that are not
-                finite. TypeError: not floating point.
-        """
+    def forward(self, gradient: Tensor) -> Tensor:
         check_gradient(gradient, 2)
-        height, width = gradient.shape[2], gradient.shape[3]
-        plan, like = self._plan, _wide(gradient)
-        if not _plan_fits(plan, like, height, width):
-            plan = _kept(plan_dct(like, height, width))
+        plan = self._plan
+        if not _plan_fits(plan, _wide(gradient), gradient.shape[2], gradient.shape[3]):
+            plan = _kept(plan_dct(_wide(gradient), gradient.shape[2], gradient.shape[3]))
             if _plain(plan[2]):
                 self._plan = plan
-        if known_mm is None or known_weight is None:
-            if known_mm is not None or known_weight is not None:
-                raise ValueError("known_mm, known_weight: expected both or neither, got one of them")
-            return _integrate_dct(gradient, self.mm_per_pixel, plan, self.zero_in_background)
-        check_known(gradient, known_mm, known_weight)
-        if gradient.shape[0] == 0:
-            return gradient[:, 0:1]
-        right = self.mm_per_pixel * divergence(widened(gradient))
-        pull = self.mm_per_pixel**2 * widened(known_weight)
-        tolerance = 1e-10 if gradient.dtype == torch.float64 else 1e-7
-        return solve_screened(right, pull, widened(known_mm), plan, tolerance).to(gradient.dtype)
+        return _integrate_dct(gradient, self.mm_per_pixel, plan, self.zero_in_background)
 
 
 class PoissonBackground(PoissonDCT):

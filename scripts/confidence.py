@@ -27,7 +27,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = parser_of(__doc__)
     parser.add_argument("--frames", type=int, default=100, help="random scenes of each kind of unit")
     parser.add_argument("--out", type=Path, default=Path("out/confidence.png"), help="the picture; its table beside it, .json")
-    parser.add_argument("--units", nargs="+", choices=UNITS, default=UNITS, metavar="UNIT", help=", ".join(UNITS))
     parser.add_argument(
         "--drawn",
         type=int,
@@ -54,8 +53,6 @@ def measure(arguments: argparse.Namespace) -> str:
     """Measure, save the picture, and return the table."""
     rows, every = [], []
     for number, unit in enumerate(UNITS):
-        if unit not in arguments.units:
-            continue
         first = 10000 + number * arguments.frames
         found = coverage.of_scenes(range(first, first + arguments.frames), unit, progress=True)
         rows += [coverage.mean(found, f"scenes, {unit}")] if found else []

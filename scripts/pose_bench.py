@@ -22,7 +22,6 @@ from torchvts.scenes import objects
 def main(argv: Sequence[str] | None = None) -> int:
     parser = parser_of(__doc__)
     parser.add_argument("--poses", type=int, default=100, help="poses of each object")
-    parser.add_argument("--size", type=int, nargs=2, default=(320, 240), metavar=("WIDTH", "HEIGHT"))
     parser.add_argument("--only", nargs="+", choices=[*objects.TARGETS, *objects.FREE_TARGETS], help="these objects")
     parser.add_argument("--clouds", type=int, metavar="POINTS", help="register clouds of so many points instead (0: all pixels)")
     parser.add_argument("--presses", type=Path, metavar="FOLDER", help="also pairs of real presses of a ball: a calibration folder")
@@ -40,14 +39,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         return vts.register_points(s, t, source_normals=n_s, target_normals=n_t)
 
     options = {} if arguments.clouds is None else {"register": by_clouds}
-    size = (arguments.size[1], arguments.size[0])
     with tqdm(total=arguments.poses * len(targets), unit="pose", disable=None) as bar:
-        rows, shown = run_poses(targets, arguments.poses, size=size, progress=bar.update, **options)
+        rows, shown = run_poses(targets, arguments.poses, progress=bar.update, **options)
     for name, (case, found) in shown.items():
         clouds = [contact_cloud(frame, case.mm_per_pixel, 4000)[0] for frame in (case.source, case.target)]
         figure = viz.pose_figure(clouds[0], clouds[1], found.T_target_source, f"{name}: {found.message}")
         viz.save_figure(figure, arguments.out / f"{name.replace(' ', '_')}.png")
-    how = f"{arguments.poses} poses each, {size[1]} x {size[0]}, noise 0.005 and 8 bits; {machine()}"
+    how = f"{arguments.poses} poses each, 320 x 240, noise 0.005 and 8 bits; {machine()}"
     text = f"{how}\n\n{pose_table(rows)}\n"
     if arguments.presses is not None:
         background, presses = vts.read_presses(arguments.presses)

@@ -4,7 +4,7 @@ python scripts/speed.py --out out/bench --threads 2
 python scripts/speed.py --only export --threads 2
 
 Methods of other libraries are timed in the same run. Rows of a real sensor need ../shared/data or the folder in TORCHVTS_DATA.
-Exported files are timed of one unit, with --drawn of the drawn rig.
+Exported files are timed of the real sensor, without one of the drawn rig.
 """
 
 import sys
@@ -26,16 +26,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--threads", type=int, default=torch.get_num_threads(), help="all cores if not given")
     parser.add_argument("--only", choices=("user", "methods", "export"), help="measure one table; export only where asked for")
     parser.add_argument("--calls", type=int, default=100, help="frames of each row of the tables of the user and of exported files")
-    exported = parser.add_argument_group("exported files")
-    exported.add_argument("--drawn", action="store_true", help="of the drawn rig, also where there is a real sensor")
-    exported.add_argument("--size", type=int, nargs=2, default=(320, 240), metavar=("WIDTH", "HEIGHT"))
     arguments = parser.parse_args(argv)
     torch.set_num_threads(arguments.threads)
     data = data_folder() if (data_folder() / "gelsight_mini_a").is_dir() else None
     if arguments.only == "export":
-        size = arguments.size[1], arguments.size[0]
-        unit = frames.drawn(size) if data is None or arguments.drawn else frames.mini(data, size)
-        print(f"{unit.name}, {size[1]}x{size[0]}, {arguments.threads} threads, median ms of a frame")
+        unit = frames.drawn((240, 320)) if data is None else frames.mini(data, (240, 320))
+        print(f"{unit.name}, 320x240, {arguments.threads} threads, median ms of a frame")
         print(frames.export_table(unit, arguments.calls))
         return 0
     with tqdm(unit="row", disable=None) as bar:

@@ -2,7 +2,8 @@
 
 python scripts/stability.py [--out out/stability] [--seeds 3] [--keep]
 
---keep also writes docs/failures, the table of breaking points in docs/where_methods_fail.md, and tests/breaking_points.json.
+--keep also writes docs/failures, the table of breaking points in docs/where_methods_fail.md, and tests/breaking_points.json;
+--redraw only draws docs/failures/overview.png again, from that file.
 """
 
 from collections.abc import Sequence
@@ -30,7 +31,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     names = list(CORRUPTIONS)
     parser.add_argument("--only", nargs="+", choices=names, default=names, metavar="CORRUPTION", help=", ".join(names))
     parser.add_argument("--keep", action="store_true", help="write docs/ and tests/breaking_points.json too")
+    parser.add_argument("--redraw", action="store_true", help="measure nothing")
     arguments = parser.parse_args(argv)
+    if arguments.redraw:
+        points, _ = stability.points_from_json((ROOT / "tests" / "breaking_points.json").read_text(encoding="utf-8"))
+        save_small(overview_figure(points), ROOT / "docs" / "failures" / "overview.png")
+        return 0
     if arguments.keep and arguments.only != names:
         parser.error("--keep: expected all corruptions, got --only")
     torch.set_num_threads(1)

@@ -6,7 +6,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from importlib import import_module
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,7 +23,7 @@ from torchvts.scenes import render, sphere_press
 from torchvts.skin import ContactFromDepth
 from torchvts.training.presses import Training, quiet_calibrate, train_network, training_pixels
 
-from .peers import GsSdkPipeline, PoissonSciPy, as_output
+from .peers import GsSdkPipeline, as_output
 
 GIVEN_NETWORK = "given network"
 """Name of a network that was trained before."""
@@ -69,7 +68,6 @@ class Method:
         learns: whether the presses influence it, so that every fold of a cross-validation needs its own.
         seen: whether it may have learned from the very presses that it is scored on.
         needs_prior: whether it is a variant for sensors that have a prior.
-        needs_module: package that must be installed.
     """
 
     name: str
@@ -80,12 +78,6 @@ class Method:
     learns: bool = True
     seen: bool = False
     needs_prior: bool = False
-    needs_module: str = ""
-
-    @property
-    def installed(self) -> bool:
-        """Whether the package that it needs is there."""
-        return not self.needs_module or find_spec(self.needs_module) is not None
 
     def calibrated(self, calibration: Calibration) -> Built:
         """The method for a calibrated unit.
@@ -328,7 +320,6 @@ METHODS: dict[str, Method] = {
         ),
         Method("precise, shadows", _shadows, style={"color": "#e69f00", "lw": 1.6, "ls": (0, (4, 1))}),
         Method("fast, zero border", _integrated("fast", PoissonDST), style={"color": "#56b4e9", "lw": 1.6, "ls": "--"}),
-        Method("fast, SciPy's DCT", _integrated("fast", PoissonSciPy), ours=False, needs_module="scipy"),
         Method("fast, PyTorch reference", _reference),
         Method("precise, plain inverse", _plain_inverse, style={"color": "#cc79a7", "lw": 1.6, "ls": (0, (6, 1, 1, 1))}),
         Method("precise, blur 1 px", _blurred, style={"color": "#009e73", "lw": 1.6, "ls": (0, (2, 1))}),

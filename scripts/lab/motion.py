@@ -16,6 +16,7 @@ from torch import Tensor
 from torchvts import viz
 from torchvts.core.blur import blur, gaussian_weights
 from torchvts.core.files import IMAGE_SUFFIXES, natural_order, read_image
+from torchvts.core.tables import markdown
 from torchvts.model.markers import FillMarkers, find_dots
 from torchvts.scenes import DottedSkin, Drag
 from torchvts.skin import DotMotion, SkinMotion
@@ -279,7 +280,7 @@ def off_depth(depth: Tensor, seed: int) -> Tensor:
     return depth + off
 
 
-def run_fields(seeds: int) -> Iterator[tuple[str, str, Row]]:
+def run_fields(seeds: int) -> Iterator[Row]:
     """The field between dots, on a grid of 4 px at least half a spacing from the border."""
     cases = {"shear 3.4 px": (DottedSkin(), drag((3.0, -1.5))), "press, turn 10 deg, shear": (DottedSkin(), MIXED),
              "the same, turn 5 deg, dots 16 px apart": (SMALL, GENTLE)}  # fmt: skip
@@ -293,16 +294,14 @@ def run_fields(seeds: int) -> Iterator[tuple[str, str, Row]]:
         for seed in range(seeds):
             frame = skin.with_noise(light, 500 + seed)
             for way, flow in (("Farneback", farneback(unit.background, frame)), ("DIS", dis(unit.background, frame))):
-                rows[way].error_px += (
-                    (at(flow, skin.seen_px(torch.nn.functional.pad(rest, (0, 1))).numpy()) - true).ravel().tolist()
-                )
+                places = skin.seen_px(torch.nn.functional.pad(rest, (0, 1))).numpy()
+                rows[way].error_px += (at(flow, places) - true).ravel().tolist()
             with torch.no_grad():
                 mean, variance = unit.motion(frame[None], depth).at(rest.float())
             error = mean[0, :, :2].numpy() / PITCH - true
             rows[OURS].error_px += error.ravel().tolist()
             rows[OURS].ratio += np.abs(error / (variance[0, :, :2].sqrt().numpy() / PITCH)).ravel().tolist()
-        for row in rows.values():
-            yield name, row.way, row
+        yield from rows.values()
 
 
 @dataclass
@@ -464,9 +463,8 @@ def run_real(data: Path, limit: int) -> Iterator[RealRow]:
                 shift = moved.displacement_mm[0, :, :2]
                 seen.append(float(known.double().mean()))
                 largest = max(largest, float(shift[known].norm(dim=1).max()))
-                apart += np.linalg.norm(at(farneback(background, frame), there.rest_px.numpy()) - shift.numpy(), axis=1)[
-                    known
-                ].tolist()
+                flow = at(farneback(background, frame), there.rest_px.numpy())
+                apart += np.linalg.norm(flow - shift.numpy(), axis=1)[known].tolist()
                 home = SkinMotion(frame, (there.rest_px + shift)[known], markers.diameter_px, 1.0, (0.0, 0.0, float("inf")))
                 start = home(frame[None], zero)
                 kept = torch.cdist(home.rest_px, (there.rest_px + shift)[known]).argmin(1)
@@ -479,54 +477,73 @@ def run_real(data: Path, limit: int) -> Iterator[RealRow]:
                 both = variance[0, :, :2] + moved.covariance_mm2[0, left_out].diagonal(dim1=1, dim2=2)[:, :2]
                 out += error.flatten().tolist()
                 ratio += (error / both.sqrt()).abs().flatten().tolist()
-        ratios = np.array(ratio)
         yield RealRow(
-            name,
-            len(there.rest_px),
-            markers.diameter_px,
-            len(chosen),
-            float(np.mean(seen)),
-            largest,
-            float(np.median(back)),
-            float(np.quantile(back, 0.99)),
-            float(np.median(apart)),
-            float(np.quantile(apart, 0.9)),
-            float(np.sqrt(np.mean(np.square(out)))),
-            float((ratios < 1).mean()),
-            float((ratios < 2).mean()),
+            *(name, len(there.rest_px), markers.diameter_px, len(chosen), float(np.mean(seen)), largest),
+            *(*np.quantile(back, (0.5, 0.99)).tolist(), *np.quantile(apart, (0.5, 0.9)).tolist()),
+            *(float(np.sqrt(np.mean(np.square(out)))), *(float((np.array(ratio) < stds).mean()) for stds in (1, 2))),
         )
 
 
 # tables
 
 
-def pairs_table(rows: list[Row]) -> str:
-    """Rms in px per axis, wrong and missing dots, coverage of ours."""
+def _within(row: Row) -> str:
+    return f"{row.within(1.0):.2f}, {row.within(2.0):.2f}" if row.ratio else ""
+
+
+TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
+    "field": (
+        "field between dots | way | rms, px | worst, px | within 1, 2 sigma",
+        lambda row: f"{row.pair} | {row.way} | {row.rms_px:.3f} | {max(map(abs, row.error_px)):.2f} | {_within(row)}",
+    ),
+    "slip": (
+        "object moves | stick | stuck share, found / true | shift off, px | turn off, deg | slip rms, px",
+        lambda row: (
+            f"{row.shift_px:g} px, {row.turn_deg:g} deg | {row.stuck:g} | {row.found:.2f} / {row.true:.2f} | "
+            f"{row.shift_error_px:.3f} | {row.turn_error_deg:+.3f} | {row.slip_rms_px:.3f}"
+        ),
+    ),
+    "film": (
+        "film to 45 px and back | way | rms, px | wrong | missing | of | gone, said to be seen",
+        lambda row: (
+            f"{row.pair} | {row.way} | {row.rms_px:.3f} | {row.wrong} | {row.missing} | {row.dots} | "
+            + (f"{row.false} of {row.gone}" if row.gone else "")
+        ),
+    ),
+    "real": (
+        "sensor | dots | frames | seen | moved, px | there and back: median, 99 % | against Farneback: median, 90 % | "
+        "one dot in five left out: rms, within 1, 2 sigma",
+        lambda row: (
+            f"{row.name} | {row.dots} of {row.diameter_px:.0f} px | {row.frames} | {row.seen:.3f} | {row.largest_px:.1f} | "
+            f"{row.back_median_px:.3f}, {row.back_99_px:.2f} | {row.flow_median_px:.3f}, {row.flow_90_px:.2f} | "
+            f"{row.left_out_rms_px:.2f}, {row.within_1:.2f}, {row.within_2:.2f}"
+        ),
+    ),
+}
+"""Titles of a part's table, and the cells of a row."""
+
+
+def table(part: str, rows: list[Any]) -> str:
+    """The rows of a part as Markdown; of pairs rms in px per axis, wrong and missing dots, and coverage of ours."""
+    if part != "pairs":
+        titles, cells_of = TABLES[part]
+        return markdown(titles.split(" | "), [cells_of(row).split(" | ") for row in rows])
     ways = list(dict.fromkeys(row.way for row in rows))
-    lines = [f"| pair, from rest | {' | '.join(ways)} | um | within 1, 2 sigma |", f"|{'---|' * (len(ways) + 3)}"]
+    lines = []
     for pair in dict.fromkeys(row.pair for row in rows):
         here = {row.way: row for row in rows if row.pair == pair}
         best = min(row.rms_px for row in here.values())
         cells = []
-        for way in ways:
-            row = here[way]
+        for row in here.values():
             text = f"**{row.rms_px:.3f}**" if row.rms_px < 1.005 * best else f"{row.rms_px:.3f}"
             text += f", {row.wrong} wrong" if row.wrong else ""
             text += f", {row.missing} missing" if row.missing else ""
-            text += f", {row.false} of {row.gone} gone seen" if row.gone else ""
-            cells.append(text)
-        ours = here[OURS]
-        lines.append(f"| {pair} | {' | '.join(cells)} | {ours.rms_um:.2f} | {ours.within(1.0):.2f}, {ours.within(2.0):.2f} |")
-    return "\n".join(lines)
+            cells.append(text + (f", {row.false} of {row.gone} gone seen" if row.gone else ""))
+        lines.append([pair, *cells, f"{here[OURS].rms_um:.2f}", _within(here[OURS])])
+    return markdown(["pair, from rest", *ways, "um", "within 1, 2 sigma"], lines)
 
 
 def to_json(rows: list[Any]) -> str:
     """The rows without their single errors."""
-    drop = ("error_px", "error_mm", "ratio")
-    return json.dumps(
-        [
-            {k: v for k, v in vars(row).items() if k not in drop} | ({"rms_px": row.rms_px} if isinstance(row, Row) else {})
-            for row in rows
-        ],
-        indent=1,
-    )
+    kept = [{key: value for key, value in vars(row).items() if not isinstance(value, list)} for row in rows]
+    return json.dumps([one | ({"rms_px": row.rms_px} if isinstance(row, Row) else {}) for one, row in zip(kept, rows)], indent=1)

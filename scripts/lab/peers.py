@@ -1,4 +1,4 @@
-"""Methods of other libraries to compare with: SciPy's cosine transform, and a frame as gs_sdk computes it."""
+"""A frame as gs_sdk computes it, to compare with."""
 
 from collections.abc import Callable
 from functools import partial
@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from torchvts.compensate import Compensate
 from torchvts.core.geometry import normal_from_gradient
@@ -15,19 +15,6 @@ from torchvts.integration import divergence, poisson_dct
 from torchvts.model import gs_sdk
 from torchvts.normals import NormalFromMLP
 from torchvts.pipeline import DepthOutput
-
-
-class PoissonSciPy(nn.Module):
-    """The free border of :class:`torchvts.PoissonBackground` by SciPy's cosine transform."""
-
-    def __init__(self, mm_per_pixel: float) -> None:
-        super().__init__()
-        self.mm_per_pixel = mm_per_pixel
-
-    def forward(self, gradient: Tensor) -> Tensor:
-        depth = torch.from_numpy(scipy_dct(gradient) * self.mm_per_pixel)
-        background = (gradient == 0).all(dim=1)[0]
-        return (depth - depth[background].mean())[None, None]
 
 
 def scipy_dct(gradient: Tensor) -> "np.ndarray[Any, Any]":

@@ -6,7 +6,7 @@ import statistics
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from torchvts.core.files import make_folder, write_atomically
 from torchvts.core.tables import markdown, number
@@ -115,16 +115,6 @@ def table(rows: Iterable[Row], columns: Sequence[Column]) -> str:
 def to_json(rows: Iterable[Row]) -> str:
     """Rows as a JSON list, one object each."""
     return json.dumps([dataclasses.asdict(row) for row in rows], indent=1)
-
-
-def from_json(text: str) -> list[Row]:
-    """The rows that :func:`to_json` wrote."""
-
-    def row(values: dict[str, Any]) -> Row:
-        size, time = values["size"], values["time"]
-        return Row(**(values | {"size": size and Size(**size), "time": time and Time(**time)}))
-
-    return [row(values) for values in json.loads(text)]
 
 
 def write_files(folder: Path, files: Mapping[str, str]) -> None:

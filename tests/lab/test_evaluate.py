@@ -12,7 +12,7 @@ import torch
 
 import torchvts as vts
 from lab import evaluate as ev
-from lab import methods, rows, sets
+from lab import methods, sets
 from lab.score import score_press
 from torchvts.core.geometry import normal_from_gradient
 from torchvts.model.gs_sdk import CATALOG_COLUMNS, LABEL_COLUMNS
@@ -128,17 +128,18 @@ def test_accuracy_writes_tables_rows_and_pictures(run_script, monkeypatch, folde
     done = run_script("accuracy", folder, "--sensor", folder / "rig.yaml", "--folds", 2, "--out", tmp_path)
     assert done.returncode == 0, done.stderr
     document = json.loads((tmp_path / "scores.json").read_text())
-    summary = {row.method: row for row in rows.from_json(json.dumps(document["rows"]))}
+    summary = {row["method"]: row for row in document["rows"]}
     assert list(summary) == [name for name in ev.COMPARED if "no prior" not in name]  # the file has none
     assert len(document["scores"]) == 5 * len(summary) and document["command"].startswith("python scripts/accuracy.py ")
     # exact lights, little noise: the model is right, and learning from three presses beats zero depth
-    assert summary["point lights"].errors["normal_deg"] < 1.5
-    assert summary["precise"].errors["normal_deg"] < 3.0 and summary["precise"].errors["level_um"] < 20.0
+    assert summary["point lights"]["errors"]["normal_deg"] < 1.5
+    assert summary["precise"]["errors"]["normal_deg"] < 3.0 and summary["precise"]["errors"]["level_um"] < 20.0
     for name in ("look-up table", "MLP"):
-        assert summary[name].errors["normal_deg"] < 0.8 * summary["flat"].errors["normal_deg"]
+        assert summary[name]["errors"]["normal_deg"] < 0.8 * summary["flat"]["errors"]["normal_deg"]
     for name in ("fast", "precise", "look-up table", "MLP"):
-        assert (summary[name].errors["used"], summary[name].errors["given"]) == (6, 6) and not summary[name].note.count("Error")
-    assert summary["flat"].error("radius_percent") is None and summary["flat"].error("iou") == 0.0
+        errors, note = summary[name]["errors"], summary[name]["note"]
+        assert (errors["used"], errors["given"]) == (6, 6) and "Error" not in note
+    assert summary["flat"]["errors"]["radius_percent"] is None and summary["flat"]["errors"]["iou"] == 0.0
     assert "not scored, no contact radius: ball/5" in done.stdout
     assert done.stdout.splitlines()[2].startswith("|") and "| flat |" in done.stdout.splitlines()[2]
     assert (tmp_path / "table.md").read_text().startswith("| data | method |")

@@ -8,4 +8,4 @@ def test_a_pair_beside_the_rivals():
     ours = rows[motion.OURS]
     assert ours.rms_px < 1.1 * rows["Farneback"].rms_px and ours.rms_px < rows["Lucas-Kanade"].rms_px
     assert ours.wrong == 0 and ours.false == 0 < rows["Farneback"].false
-    assert "| half of the dots gone |" in motion.pairs_table(list(rows.values()))
+    assert "| half of the dots gone |" in motion.table("pairs", list(rows.values()))

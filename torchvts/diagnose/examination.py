@@ -22,9 +22,6 @@ from ..skin import DotMotion, motion_of_unit
 from ..skin.weight import WEIGHT_CELLS, spread_of
 from .camera import levels_of
 
-TILTED_DEG = 3.0
-"""Tilt from which a normal counts as one of a contact."""
-
 MISFITS = 0.05
 """Share of a contact in which the length of the normals may be off by three standard deviations; without a cause it is 0.003."""
 
@@ -71,10 +68,10 @@ class Examination:
         """The pipeline of the unit."""
         return DepthPipeline.from_calibration(self.unit, "precise").eval()
 
-    def read(self, value: Tensor, pipeline: DepthPipeline | None = None) -> tuple[Frame, Tensor]:
+    def read(self, value: Tensor) -> tuple[Frame, Tensor]:
         """The frame of an image (3, H, W), compensated and weighted, and its slopes (1, 2, H, W) before they are weighted."""
         with torch.no_grad():
-            frame, slopes = (pipeline or self.pipeline).frame_of(value[None].to(self.unit.background.dtype))
+            frame, slopes = self.pipeline.frame_of(value[None].to(self.unit.background.dtype))
         return frame, slopes.double()
 
     @cached_property
@@ -120,11 +117,7 @@ class Examination:
     @cached_property
     def free_deg(self) -> float:
         """Spread of the slopes that the pipeline reads, before it takes them to be none, where the skin has changed least."""
-        return self.spread_deg(self.frame_and_slopes[1])
-
-    def spread_deg(self, slopes: Tensor) -> float:
-        """The same of slopes (1, 2, H, W)."""
-        cells = whole_cell_means(slopes, max(1, min(self.image.shape[1:]) // WEIGHT_CELLS))
+        cells = whole_cell_means(self.frame_and_slopes[1], max(1, min(self.image.shape[1:]) // WEIGHT_CELLS))
         return math.degrees(math.atan(float(spread_of(cells.abs().flatten(2), 1e-9).max())))
 
     # ---- the camera ----
@@ -143,14 +136,8 @@ class Examination:
         """Median angle by which noise (3,) of the image value changes the normal of undeformed skin."""
         noise = torch.randn(self.value.shape, generator=torch.Generator().manual_seed(0))
         noisy = (self.value + noise * std.reshape(3, 1, 1)).clamp(0.0, 1.0)
-        return self.difference_deg(self.read(self.value)[1], self.read(noisy)[1])[0]
-
-    def difference_deg(self, one: Tensor, other: Tensor) -> tuple[float, float]:
-        """Median angle between normals by their slopes, and the mean where they are tilted."""
-        normals = normal_from_gradient(one), normal_from_gradient(other)
-        angle = angles_deg(*normals)[0].nan_to_num(0.0)
-        tilted = normals[1][0, 2] < math.cos(math.radians(TILTED_DEG))
-        return float(angle.median()), float(angle[tilted].mean()) if float(tilted.double().mean()) > 0.01 else 0.0
+        normals = (normal_from_gradient(self.read(value)[1]) for value in (self.value, noisy))
+        return float(angles_deg(*normals)[0].nan_to_num(0.0).median())
 
     @cached_property
     def check(self) -> FrameCheck:

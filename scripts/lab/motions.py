@@ -18,25 +18,27 @@ class Motion:
         frames: number of frames, the reference among them.
         pose: T_sensor_object (4, 4) of a frame, from its number and a seed.
         lost: frames that must be reported as lost.
+        again: frames that are the one before once more, as of a camera that stands still for a while.
     """
 
     frames: int
     pose: Callable[[int, int], Tensor]
     lost: tuple[int, ...] = ()
+    again: tuple[int, ...] = ()
 
 
 def _phases(seed: int) -> list[float]:
     return (2.0 * math.pi * torch.rand(5, generator=torch.Generator().manual_seed(seed))).tolist()
 
 
-def _sweep(turn_deg: float, frames: int) -> Callable[[int, int], Tensor]:
-    """Yaw at an even rate, with shifts of 1 mm and tilts of 2.5 degrees on the way."""
+def _sweep(turn_deg: float, frames: int, shift_mm: float = 1.0, tilt_deg: float = 2.5) -> Callable[[int, int], Tensor]:
+    """Yaw at an even rate, with shifts and tilts of such amplitudes on the way."""
 
     def pose(k: int, seed: int) -> Tensor:
         a, b, c, d, e = _phases(seed)
         s = 2.0 * math.pi * k / (frames - 1)
-        shift = (math.sin(s + a) - math.sin(a), math.sin(1.5 * s + b) - math.sin(b))
-        tilt = (2.5 * math.sin(2.0 * s + c), 2.5 * math.cos(1.5 * s + d))
+        shift = (shift_mm * (math.sin(s + a) - math.sin(a)), shift_mm * (math.sin(1.5 * s + b) - math.sin(b)))
+        tilt = (tilt_deg * math.sin(2.0 * s + c), tilt_deg * math.cos(1.5 * s + d))
         return objects.pose(turn_deg * k / (frames - 1), shift, 0.45 + 0.1 * math.sin(s + e), tilt)
 
     return pose
@@ -70,6 +72,14 @@ def _jump(k: int, seed: int) -> Tensor:
     return objects.pose(0.5 * k + 40.0 * jumped, (3.0 * jumped * math.cos(a), 3.0 * jumped * math.sin(a)), 0.45, (1.0, 1.0))
 
 
+_AGAIN = (1, 2, 3, *range(14, 24))
+
+
+def _paused(k: int, seed: int) -> Tensor:
+    """As slow, but for frames that come again: three after the reference, and ten later on."""
+    return _sweep(90.0, 40)(k - sum(frame <= k for frame in _AGAIN), seed)
+
+
 MOTIONS = {
     "slow": Motion(40, _sweep(90.0, 40)),
     "fast": Motion(14, _sweep(90.0, 14)),
@@ -78,4 +88,5 @@ MOTIONS = {
     "slip": Motion(20, _slip),
     "lift-off": Motion(24, _lift_off, (9, 10, 11, 12, 13)),
     "jump": Motion(20, _jump, (10,)),
+    "paused": Motion(34, _paused, again=_AGAIN),
 }

@@ -303,7 +303,7 @@ def test_a_frame_becomes_a_keyframe_before_what_shows_the_rotation_is_gone(monke
     """The corners of a bolt head leave the image: its contact stays, and the first frame shows its rotation no more."""
     slow = tracking.MOTIONS["slow"].pose
     late = tracking.Motion(13, lambda k, seed: slow(k and 27 + k, seed))
-    track = tracking.record(objects.TARGETS["bolt head"], late, 22, pose_accuracy.rig())
+    track = tracking.record(objects.TARGETS["bolt head"], late, 0.005, 22, pose_accuracy.rig())
     worst = []
     for vaguer in (tracker_module.VAGUER, math.inf):
         monkeypatch.setattr(tracker_module, "VAGUER", vaguer)
@@ -542,7 +542,7 @@ def test_a_bad_reference_is_refused():
 
 def test_frames_that_come_again_say_nothing_of_what_is_usual():
     """Their slopes differ by nothing; a unit whose slopes err was lost for good as soon as the object moved."""
-    unit = tracking.WrongSlopes(_bad(press(objects.gear(), swing(0))), 3.0, 1, PITCH)
+    unit = tracking.WrongSlopes(_bad(press(objects.gear(), swing(0))), tracking.Noise(0.0, 3.0, 2.5), 1, PITCH)
     frames = [unit(_bad(press(objects.gear(), swing(k))), k) for k in range(6)]
     tracker = vts.PoseTracker(frames[0], PITCH)
     assert not [found.lost for found in map(tracker, [frames[0]] * 4 + frames[1:]) if found.lost]
@@ -576,7 +576,7 @@ def test_the_stated_uncertainty_is_that_of_the_errors():
     """Slopes that err alike over a contact, in both frames: the root mean square of error over standard deviation is about 1."""
     ratios = []
     for seed in (1, 2):
-        unit = tracking.WrongSlopes(_bad(press(objects.gear(), swing(0))), 3.0, seed, PITCH)
+        unit = tracking.WrongSlopes(_bad(press(objects.gear(), swing(0))), tracking.Noise(0.0, 3.0, 2.5), seed, PITCH)
         tracker = vts.PoseTracker(unit(_bad(press(objects.gear(), swing(0))), 0), PITCH)
         for k in range(1, 13, 2):
             found = tracker(unit(_bad(press(objects.gear(), swing(k))), k))

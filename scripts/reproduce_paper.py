@@ -111,8 +111,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments.out.mkdir(parents=True, exist_ok=True)
     tacto = arguments.data / "tacto"
     lines = ["Figure 4: TACTO renders, calibrated from the one background image, precise", ""]
-    without = f"not run: no {tacto} (scripts/render_tacto.py of commit 64b714f renders it)"
-    lines += figure_4(tacto, arguments.out) if tacto.is_dir() else [without]
+    lines += figure_4(tacto, arguments.out) if tacto.is_dir() else [f"not run: no {tacto} (scripts/render_tacto.py renders it)"]
     mini = arguments.data / "gelsight_mini_a"
     lines += ["", "Table 2: a real GelSight Mini, held-out presses, RMSE between model-based and look-up depth", ""]
     lines += table_2(mini, arguments.out) if mini.is_dir() else [f"not run: no {mini}"]

@@ -105,9 +105,6 @@ TABLE = {
         {"background": torch.full((3, 64, 64), 0.5), "margin": 0.2}, {
         "background": [b for b in images(64, 64) if not (isinstance(b, torch.Tensor) and tuple(b.shape) == (3, 63, 64))],
         "margin": NUMBER}),
-    "FillMarkers.from_dict": Entry({"values": FillMarkers().to_dict(), "source": "file"},
-        {"values": [None, [], {"unknown": 1.0}, {"contrast": -1}]}, label=("source",), named={"values": "file"},
-        file=("values",)),
     "FillMarkers.forward": forward(lambda: FillMarkers(), 3, "image"),
     "GradientFromNormal": Entry({"max_slope": 10.0}, {"max_slope": NUMBER}),
     "GradientFromNormal.forward": forward(lambda: vts.GradientFromNormal(), 3, "normal"),

@@ -78,7 +78,6 @@ CAUSES = [
     ("fit_mlp", "xy", PLACES, r"expected columns in \[0, 31\] and rows in \[0, 23\] like flat, got .*x stands first"),
     ("fit_mlp", "slope", SLOPES / 0, "expected finite slopes up to 9.5, got nan: keep 3 pixels inside"),
     ("fit_mlp", "groups", torch.zeros(9).long(), "expected two presses or more, got 1"),
-    ("gs_sdk.sensor_from_gs_sdk", "config", {"ppmm": 15.8, "imgh": 240, "imgw": 320}, r"in \(0, 1\], got 15.8: the name misleads"),
     ("gs_sdk.image_from_bgr", "pixels", TWO[0].expand(3, 8, 8).numpy().astype("uint8"), "channels stand first"),
     ("gs_sdk.image_to_bgr", "image", GOOD[None], "take one image of the batch"),
     ("bound_at", "level", 95.0, r"expected a probability between 0 and 1, got .*: 0\.95, not 95"),

@@ -16,9 +16,6 @@ TABLE = {
     # ---- gs_sdk ----
     "gs_sdk.read_calibration_folder": Entry({"folder": ...}, {"folder": [Path("no/such"), ".", None]}, file=("folder",), run=False),
     "gs_sdk.read_labels": Entry({"folder": ...}, {"folder": [Path("no/such"), ".", None]}, file=("folder",), run=False),
-    "gs_sdk.sensor_from_gs_sdk": Entry({"config": {"ppmm": 0.0634, "imgh": 240, "imgw": 320}}, {"config": [None, 3, [], {},
-        {"ppmm": 15.8, "imgh": 240, "imgw": 320}, {"ppmm": 0.1, "imgh": 1, "imgw": 320}, {"a": 1}, "no/such.yaml"]},
-        file=("config",), label=("name",)),
     "gs_sdk.depth_from_height_map": Entry({"height_map_px": MAP, "mm_per_pixel": 1.0}, {"height_map_px": BAD_MAP}),
     "gs_sdk.height_map_from_depth": Entry(
         {"depth_mm": DEPTH, "mm_per_pixel": 1.0}, {"depth_mm": [*batches(1), torch.zeros(2, 1, 4, 4)]}),

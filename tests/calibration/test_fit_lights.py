@@ -54,8 +54,6 @@ def test_low_lights_of_a_worn_unit(low_rig):
     assert fit.converged
     assert furthest_mm(fit.lights, low_rig) < 0.04  # the aim is 0.1
     assert float((fit.lights.albedo.detach() / low_rig.albedo - 1).abs().max()) < 0.002
-    assert fit.noise_std.tolist() == pytest.approx([0.01] * 3, rel=0.06)
-    assert 0.8 < fit.inlier_fraction < 1.0
 
 
 def test_the_stated_spread_is_the_true_one(low_rig, small_sensor):
@@ -163,7 +161,7 @@ def test_the_camera_is_found_and_the_depth_does_not_feel_it(low_rig, small_senso
         warnings.simplefilter("error", vts.CalibrationWarning)
         calibration = vts.calibrate(seen(flat, low_rig, gamma=gamma)[0], small_sensor)
     report = calibration.report
-    assert (report["model"], report["family"], report["gamma"]) == ("point_lights", "three lights", gamma)
+    assert report["model"] == "point_lights" and calibration.sensor.gamma == gamma and not calibration.lights.glossy
     assert furthest_mm(calibration.lights, low_rig) < 0.1
     assert largest_px(calibration, low_rig, gamma=gamma) < 0.3
     assert json.loads(json.dumps(report)) == report

@@ -222,14 +222,16 @@ def test_printed_markers(mode, side, size):
 @pytest.mark.parametrize("mode", MODES)
 def test_a_pinhole_camera_and_other_integrators(mode):
     calibration, images = lights_unit((96, 128), 0.25)
+    agree(vts.DepthPipeline.from_calibration(calibration, mode, integrate=vts.PoissonBackground(0.25)), images[:3])
     normals = vts.NormalFromIntensity.from_calibration(calibration, camera_height_mm=60.0)
-    blocks = {"normals": normals, "integrate": vts.PoissonBackground(0.25)}
-    agree(vts.DepthPipeline.from_calibration(calibration, mode, **blocks), images[:3])
-    other = vts.DepthPipeline.from_calibration(calibration, mode, integrate=vts.PoissonDST(0.25))
-    frozen = other.freeze()
-    assert not frozen.compiled and frozen.not_compiled == "integrate is PoissonDST"
-    assert repr(frozen).endswith("in PyTorch: integrate is PoissonDST)")
-    assert float((frozen(images).depth_mm - other(images).depth_mm).abs().max()) <= DEPTH_MM
+    for blocks, named in (
+        ({"normals": normals}, "normals.camera_height_mm is 60.0, not inf as elsewhere in the pipeline"),
+        ({"integrate": vts.PoissonDST(0.25)}, "integrate is PoissonDST"),
+    ):
+        other = vts.DepthPipeline.from_calibration(calibration, mode, **blocks)
+        frozen = other.freeze()
+        assert not frozen.compiled and frozen.not_compiled == named and repr(frozen).endswith(f"in PyTorch: {named})")
+        assert float((frozen(images).depth_mm - other(images).depth_mm).abs().max()) <= DEPTH_MM
 
 
 def test_the_real_mini(data):

@@ -19,7 +19,6 @@ from torchvts.model.gs_sdk import (
     image_to_bgr,
     read_calibration_folder,
     read_labels,
-    sensor_from_gs_sdk,
 )
 
 HEIGHT, WIDTH = 12, 16
@@ -203,17 +202,18 @@ def test_labels_table(tmp_path):
 CONFIG = {"ppmm": 0.0634, "imgh": 240, "imgw": 320, "raw_imgh": 2464, "raw_imgw": 3280, "framerate": 25}
 
 
+def loaded(folder, config):
+    (folder / "mini.yaml").write_text(yaml.safe_dump(config))
+    return vts.Sensor.load(folder / "mini.yaml")
+
+
 def test_a_sensor_file_is_read(tmp_path):
     expected = vts.Sensor("mini", 240, 320, 0.0634, raw_size_px=((2464, 3280),), raw_crop=1 / 7)
-    assert sensor_from_gs_sdk(CONFIG, name="mini") == expected
-    (tmp_path / "mini.yaml").write_text(yaml.safe_dump(CONFIG))
-    assert sensor_from_gs_sdk(tmp_path / "mini.yaml") == expected
-    assert sensor_from_gs_sdk(str(tmp_path / "mini.yaml"), name="left").name == "left"
-    assert vts.Sensor.load(tmp_path / "mini.yaml") == expected
-    same = sensor_from_gs_sdk(CONFIG | {"raw_imgh": 240, "raw_imgw": 320})
+    assert loaded(tmp_path, CONFIG) == expected
+    same = loaded(tmp_path, CONFIG | {"raw_imgh": 240, "raw_imgw": 320})
     frame = torch.linspace(0, 1, 320).expand(1, 3, 240, 320)
     assert same.rectify(frame)[0, 0, 0].tolist() == pytest.approx(torch.linspace(45 / 320, 275 / 320, 320).tolist(), abs=0.005)
-    assert sensor_from_gs_sdk({"ppmm": 0.0634, "imgh": 240, "imgw": 320}).raw_size_px == ()
+    assert loaded(tmp_path, {"ppmm": 0.0634, "imgh": 240, "imgw": 320}).raw_size_px == ()
 
 
 @pytest.mark.parametrize(
@@ -225,9 +225,9 @@ def test_a_sensor_file_is_read(tmp_path):
         ({"imgw": 0}, "key imgw: expected at least 8"),
     ],
 )
-def test_a_bad_sensor_file_is_refused(change, message):
-    with pytest.raises(ValueError, match=f"^config: {message}"):
-        sensor_from_gs_sdk(CONFIG | change)
+def test_a_bad_sensor_file_is_refused(tmp_path, change, message):
+    with pytest.raises(ValueError, match=rf"mini\.yaml: {message}"):
+        loaded(tmp_path, CONFIG | change)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

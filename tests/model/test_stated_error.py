@@ -53,10 +53,10 @@ def test_the_covariance_survives_the_file(tmp_path):
 @pytest.mark.parametrize(
     "change, message",
     [
-        (lambda c: c[:-1], r"tensor 'covariance': expected \(120,\) floats"),
-        (lambda c: c.to(torch.int64), r"tensor 'covariance': expected \(120,\) floats"),
-        (lambda c: c.index_fill(0, torch.tensor([3]), float("nan")), "tensor 'covariance': expected finite values"),
-        (lambda c: -c, "tensor 'covariance': expected a positive diagonal"),
+        (lambda c: c[:-1], r"covariance: expected \(120,\)"),
+        (lambda c: c.to(torch.int64), "covariance: expected floating point"),
+        (lambda c: c.index_fill(0, torch.tensor([3]), float("nan")), "covariance: expected finite values"),
+        (lambda c: -c, "covariance: expected .* with a positive diagonal"),
     ],
 )
 def test_a_damaged_covariance_is_refused(tmp_path, change, message):
@@ -95,10 +95,3 @@ def test_a_prior_without_presses_states_an_error():
     assert calibration.report["source"] == "prior" and calibration.covariance.shape == (size, size)
     steep = stated_error_deg(calibration, torch.full((1, 3, 240, 320), 1.3))
     assert float(steep.min()) > calibration.report["own_deg"]
-
-
-def test_a_model_of_an_older_file_is_read():
-    """Files once said how steep and deep the presses were, which the covariance says now."""
-    model = unit().response
-    older = model.to_dict() | {"taught": {"sine": 0.6, "depth_mm": 1.5, "growth": 1.0}}
-    assert ResponseModel.from_dict(older, "unit.safetensors") == ResponseModel.from_dict(model.to_dict(), "unit.safetensors")

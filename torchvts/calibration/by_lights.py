@@ -62,24 +62,12 @@ def by_lights(background: Tensor, sensor: Sensor, progress: bool = False) -> tup
         "model": "point_lights",
         "source": "background",
         "reason": f"point lights: {constrained if fit.converged else fit.message}",
-        "family": _family(fit),
         "converged": fit.converged,
-        "message": fit.message,
-        "steps": len(fit.loss_history),
-        "loss": fit.loss_history[-1],
-        "gamma": linear.exponent,
         "direction_std_deg": fit.direction_std_deg.tolist(),
-        "position_std_mm": fit.position_std_mm.tolist(),
         "misfit": fit.misfit.tolist(),
-        "inlier_fraction": fit.inlier_fraction,
-        "gloss": fit.lights.gloss.tolist(),
     }
     doubts = [] if fit.converged and loosest <= POORLY_CONSTRAINED_DEG else [f"background: {fit.message}"]
     return Calibration.from_lights(fit.lights, linear, background, report), doubts
-
-
-def _family(fit: LightFit) -> str:
-    return "three lights" + ", glossy skin" * fit.lights.glossy
 
 
 def _fit(background: Tensor, sensor: Sensor, progress: bool) -> tuple[LightFit, Sensor]:
@@ -122,8 +110,7 @@ def _given(
     # the albedo that makes the median of image / model one in each channel
     albedo = (background.to(model.dtype) ** sensor.exponent / model).flatten(1).median(dim=1).values
     lights = PointLights(lights.position_mm.detach(), torch.clamp_min(albedo, 1e-6))
-    family = "three lights at known positions"
-    report: Report = {"model": "point_lights", "source": "sensor_file", "converged": True, "family": family}
+    report: Report = {"model": "point_lights", "source": "sensor_file", "converged": True}
     unit = Calibration.from_lights(lights, sensor, background, report)
     cell = max(1, min(sensor.height, sensor.width) // 30)
     log = [torch.nn.functional.avg_pool2d(i[None], cell).clamp_min(1e-3).log() for i in (unit.background, unit.model_image)]

@@ -73,8 +73,7 @@ def _from_lights(given: Given) -> Made:
     unit, found = by_lights(given.background, given.sensor, given.progress)
     doubts = [Doubt(text, True) for text in found]
     if unit.report["source"] == "background":
-        unit, more = of_fitted_lights(unit)
-        doubts += more
+        doubts += of_fitted_lights(unit)
     return Made(unit, doubts, "point lights")
 
 

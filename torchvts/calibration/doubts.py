@@ -1,6 +1,5 @@
 """What speaks against given presses, sizes and backgrounds: doubts, each a sentence with its figure and its remedy."""
 
-import dataclasses
 import math
 import statistics
 from collections.abc import Sequence
@@ -14,7 +13,7 @@ from ..core.arrays import array_of
 from ..core.levels import SATURATED
 from ..core.views import Views
 from ..model.calibration import Calibration
-from ..model.report import NOT_CHECKED, Report
+from ..model.report import NOT_CHECKED
 from ..model.response_field import ResponseField
 from ..model.sensor import Sensor
 from .by_lights import NOTHING_LEFT
@@ -272,17 +271,15 @@ def of_type(background: Tensor, sensor: Sensor) -> list[Doubt]:
     ]
 
 
-def of_fitted_lights(unit: Calibration) -> tuple[Calibration, list[Doubt]]:
-    """A background that differs from the lights that were fitted to it: smoothly, in places, or as a gloss would; the calibration
-    with the residual in its report."""
+def of_fitted_lights(unit: Calibration) -> list[Doubt]:
+    """A background that differs from the lights that were fitted to it: smoothly, in places, or as a gloss would."""
     model = unit.model_image
     spread = (model - unit.background).abs().flatten(1).median(dim=1).values / 0.6745
     # contact changes the light by more than 5 % and is wider than dirt: 5 sigmas of the residual and of 1 % of the model
     saturated = (unit.background > SATURATED) | (model > 0.95)
     change = (unit.background - model).masked_fill(saturated, 0.0)
     standing_out = float(differing(change, spread.reshape(3, 1, 1) + 0.01 * model).double().mean())
-    report: Report = {**unit.report, "residual_std": spread.tolist()}
-    left = max(report.get("misfit", [0.0]))
+    left = max(unit.report.get("misfit", [0.0]))
     found = []
     if left > NOTHING_LEFT:
         found.append(
@@ -309,4 +306,4 @@ def of_fitted_lights(unit: Calibration) -> tuple[Calibration, list[Doubt]]:
                 "them apart, and depth differs by a tenth or more: press a ball three times to measure it"
             )
         )
-    return dataclasses.replace(unit, report=report), found
+    return found

@@ -62,11 +62,8 @@ class LightFit:
         loss_history: robust loss per step, in units of the noise.
         direction_std_deg: (3,), standard deviation of each light's direction seen from the image centre.
         position_std_mm: (3, 3), of each position coordinate.
-        residual_std: (3,), robust standard deviation of image minus model, in image value.
-        noise_std: (3,), noise of the image by itself, in image value.
         misfit: (3,), size of the smooth pattern in the image that the lights cannot explain, relative to the light: 0.02 is 2 %
             of the light, 0 where only noise is left.
-        inlier_fraction: share of the pixels that the robust loss kept.
     """
 
     lights: PointLights
@@ -75,10 +72,7 @@ class LightFit:
     loss_history: list[float] = field(repr=False)
     direction_std_deg: Tensor = field(repr=False)
     position_std_mm: Tensor = field(repr=False)
-    residual_std: Tensor = field(repr=False)
-    noise_std: Tensor = field(repr=False)
     misfit: Tensor = field(repr=False)
-    inlier_fraction: float = 1.0
     failed: bool = False
 
 
@@ -149,7 +143,6 @@ class _Solution(NamedTuple):
     converged: bool
     failure: str
     moved_mm: float
-    weight: Tensor
     scale: Tensor
     covariance: Tensor
     misfit: Tensor
@@ -222,10 +215,10 @@ def _solve(pixels: BackgroundPixels, start: Tensor, loop: _Loop) -> _Solution:
     if failure:  # nothing is known, nothing explained
         unknown = torch.full_like(start, 1e12).diag_embed()
         nothing = torch.full((3,), torch.inf)
-        return _Solution(start, [*history, math.inf], False, failure, math.inf, weight, scale, unknown, nothing)
+        return _Solution(start, [*history, math.inf], False, failure, math.inf, scale, unknown, nothing)
     covariance, misfit = covariance_and_misfit(fit)
     converged = still == 3 and not bool(at_bound(parameter, span).any())
-    return _Solution(parameter, history, converged, "", moved, weight, scale, covariance, misfit)
+    return _Solution(parameter, history, converged, "", moved, scale, covariance, misfit)
 
 
 def _failure(fit: Linearisation, scale: Tensor, never_moved: bool) -> str:
@@ -256,19 +249,16 @@ def _moved_mm(step: Tensor, parameter: Tensor) -> float:
 
 def _light_fit(dtype: torch.dtype, pixels: BackgroundPixels, best: _Solution, max_steps: int) -> LightFit:
     direction_std, position_std = direction_and_position_std(best.parameter, best.covariance)
-    residual_std = best.scale[:, 0] * pixels.noise
+    residual = best.scale[:, 0] * pixels.noise / pixels.image.median(dim=1).values
     return LightFit(
         lights=to_lights(best.parameter, dtype),
         converged=best.converged,
-        message=_message(best, direction_std, residual_std / pixels.image.median(dim=1).values, pixels, max_steps),
+        message=_message(best, direction_std, residual, pixels, max_steps),
         failed=bool(best.failure),
         loss_history=best.history,
         direction_std_deg=direction_std,
         position_std_mm=position_std,
-        residual_std=residual_std,
-        noise_std=pixels.noise,
         misfit=best.misfit,
-        inlier_fraction=float((best.weight > 0).double().mean()),
     )
 
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from torch import Tensor
 
 from ..core.checks import check_image, check_switch
-from ..core.threads import OneThread
+from ..core.threads import one_thread
 from ..model.calibration import Calibration
 from ..model.report import warnings_of
 from ..model.sensor import Sensor, check_sensor
@@ -71,7 +71,7 @@ def calibrate(
     named = check_presses(presses, sensor)
     kept, left_out = sort_presses(background, named)
     check_light(background, kept)
-    with OneThread(background[0].numel()):
+    with one_thread(background[0].numel()):
         calibration = choose(Given(background, sensor, kept, progress, force))
     report = calibration.report
     for k, reason in left_out:

@@ -1,6 +1,7 @@
 """What the compiled stages need of each block of a pipeline. What has no compiled form is refused by name."""
 
 import inspect
+import math
 
 import torch
 from torch import Tensor, nn
@@ -78,19 +79,21 @@ def _floats(values: object, dtype: torch.dtype = torch.float32) -> Tensor:
     return torch.as_tensor(values, dtype=dtype)
 
 
+def _same(block: nn.Module, *names: str) -> Values:
+    """Fields that a block holds under their names."""
+    return {name: getattr(block, name) for name in names}
+
+
 def compensate_values(block: nn.Module, size: tuple[int, int]) -> Values:
     """Of :class:`Compensate`."""
     check_block("compensate", block, Compensate)
     assert isinstance(block, Compensate)
     gain = block.gain
     check_block("compensate.gain", gain, Gain)
-    offset = None if gain.offset is None else _map("compensate.gain.offset", gain.offset, size)
-    pedestal = _pedestals(gain.gain, offset)
     none = torch.zeros(0, dtype=torch.int64)
     values: Values = _light_values(block.linear) | {
         "gain": _map("compensate.gain.gain", gain.gain, size),
-        "offset": offset if pedestal is None else None,
-        "pedestal": torch.zeros(3, dtype=torch.float32) if pedestal is None else pedestal,
+        "pedestal": _pedestals(gain),
         "defect": none,
         "neighbours": none,
         "defects": 0,
@@ -127,12 +130,15 @@ def _light_values(linear: nn.ModuleList) -> Values:
 _MARKERS = {f"marker_{name.removesuffix('_px')}": name for name in FillMarkers().to_dict()}
 
 
-def _pedestals(gain: Tensor | None, offset: Tensor | None) -> Tensor | None:
-    """What the offset is of the gain, (3,), where it is exactly one number a channel; else None."""
-    if gain is None or offset is None:
-        return None
-    found = (offset.double() / gain.double()).flatten(1).mean(dim=1).to(gain.dtype)
-    return found if torch.equal(found[:, None, None] * gain, offset) else None
+def _pedestals(block: Gain) -> Tensor:
+    """What is added to each channel before the gain, (3,)."""
+    if block.offset is None:
+        return torch.zeros(3, dtype=torch.float32)
+    before = block.offset.double() / (1.0 if block.gain is None else block.gain.double())
+    found = before.flatten(1).mean(dim=1)
+    if float((before - found[:, None, None]).abs().max()) > 1e-6:
+        raise NotCompiled("compensate.gain.offset is no number of each channel times the gain")
+    return found.float()
 
 
 def _relight_values(block: nn.Module, size: tuple[int, int]) -> Values:
@@ -158,15 +164,9 @@ def _relight_values(block: nn.Module, size: tuple[int, int]) -> Values:
         "relight_scales": _floats(source.scales, torch.float64),
         "along_x": source.x[1:],
         "along_y": source.y[1:],
-        "saturation_light": source.saturation_light,
-        "black": source.black,
-        "alike": source.alike,
-        "exact": source.exact,
-        "damping": source.damping,
-        "better": source.better,
         "lost": source.most_lost,
         "least_light": source.least,
-    }
+    } | _same(source, "saturation_light", "black", "alike", "exact", "damping", "better")
 
 
 def normals_values(name: str, model: nn.Module, gradient: nn.Module) -> Values:
@@ -189,8 +189,8 @@ def normals_values(name: str, model: nn.Module, gradient: nn.Module) -> Values:
 
 _LIGHTS = (
     "by_lights", "inverse", "flat_light", "saturated_above", "ill_conditioned", "any_ill_conditioned", "position", "albedo",
-    "per_camera_height", "noise_std", "prior_std", "brightness_noises", "least_brightness",
-    "shadow_steps", "cliff_slope", "start_slope", "left_out", "failed_share",
+    "noise_std", "prior_std", "brightness_noises", "least_brightness",
+    "shadow_steps", "cliff_slope", "start_slope", "failed_share",
 )  # fmt: skip
 _RESPONSE = ("field_place", "field", "degree", "terms", "per_mm", "steeper", "reference_mm", "max_sine")
 
@@ -198,6 +198,7 @@ _RESPONSE = ("field_place", "field", "degree", "terms", "per_mm", "steeper", "re
 def _lights_values(name: str, model: NormalFromIntensity) -> Values:
     if model.lights.glossy:
         raise NotCompiled(f"{name}.lights are glossy")
+    check_equal(f"{name}.camera_height_mm", model.camera_height_mm, math.inf)
     model.follow_lights()
     shadowed = model.shadowed
     check_block(f"{name}.shadowed", shadowed, shadowed_module.ShadowedPixels)
@@ -214,17 +215,13 @@ def _lights_values(name: str, model: NormalFromIntensity) -> Values:
         "any_ill_conditioned": shadowed.any_ill_conditioned,
         "position": model.lights.position_mm,
         "albedo": model.lights.albedo,
-        "per_camera_height": 1.0 / model.camera_height_mm,
         "noise_std": shadowed.noise_std,
         "prior_std": shadowed_module.PRIOR_STD,
-        "brightness_noises": shadowed.brightness_noises,
-        "least_brightness": shadowed.least_brightness,
         "shadow_steps": shadowed_module.SLOPE_STEPS,
         "cliff_slope": CLIFF_SLOPE,
         "start_slope": MAX_SLOPE,
-        "left_out": shadowed.left_out,
         "failed_share": shadowed_module.FAILED_SHARE,
-    }
+    } | _same(shadowed, "brightness_noises", "least_brightness")
 
 
 def _response_values(name: str, model: NormalFromResponse) -> Values:
@@ -244,10 +241,7 @@ def _response_values(name: str, model: NormalFromResponse) -> Values:
         "degree": field.shape[3] - 1,
         "terms": maps.shape[0],
         "per_mm": by_depth.transpose(0, 1).float() if model.uses_depth else None,
-        "steeper": model.steeper,
-        "reference_mm": model.reference_mm,
-        "max_sine": model.max_sine,
-    }
+    } | _same(model, "steeper", "reference_mm", "max_sine")
 
 
 def _polynomials(maps: Tensor, place: Tensor, degree: int) -> Tensor | None:
@@ -259,16 +253,14 @@ def _polynomials(maps: Tensor, place: Tensor, degree: int) -> Tensor | None:
     return found
 
 
-def solver_values(name: str, block: nn.Module, values: Values) -> Values:
-    """Of an integrator, for the pitch in ``values``; its tables the library makes.
+def check_solver(name: str, block: nn.Module, mm_per_pixel: float) -> None:
+    """Raise unless an integrator is the one that the library has; where its depth is zero does not matter, for that is found later.
 
     Raises:
         NotCompiled: another integrator, or another pitch.
     """
     check_block(name, block, PoissonDCT, PoissonBackground)
-    assert isinstance(block, PoissonDCT)
-    check_equal(f"{name}.mm_per_pixel", block.mm_per_pixel, values["mm_per_pixel"])
-    return {"zeroed": block.zero_in_background}
+    check_equal(f"{name}.mm_per_pixel", block.mm_per_pixel, mm_per_pixel)
 
 
 def mask_values(block: nn.Module, size: tuple[int, int], takes_slopes: bool) -> Values:
@@ -285,18 +277,14 @@ def mask_values(block: nn.Module, size: tuple[int, int], takes_slopes: bool) -> 
         "mask_blur": _floats(block.weights),
         "mask_taps": len(block.weights),
         "takes_slopes": takes_slopes,
-        "by_colour": block.by_colour,
         "rise_from": block.rise[0],
         "rise_to": block.rise[1],
-        "sigmas": block.sigmas,
-        "least_spread": block.least_spread,
-        "grey_share": block.grey_share,
         "failed_light": block.failed,
         "within": weight_module.WITHIN,
         "square_within": weight_module.SQUARE_WITHIN,
         "fewest": weight_module.FEWEST,
         "moved_depth": weight_module.LEAST_DEPTH,
-    }
+    } | _same(block, "by_colour", "sigmas", "least_spread", "grey_share")
 
 
 def _full(name: str, value: Tensor, size: tuple[int, int]) -> Tensor:
@@ -329,12 +317,7 @@ def zero_values(block: nn.Module, size: tuple[int, int]) -> Values:
         "pixel_x": zero_module.cosines(size[1], m, w * cell, like).float(),
         "by_pressure": zero_module.pressure_of_waves(k, m, (h, w), pitch, block.decay_mm, like),
         "zero_decay": (block.decay_mm / pitch) ** 2,
-        "face": block.face,
-        "smooth_mm": block.smooth_mm,
-        "stiff": block.stiff,
-        "pit": block.pit,
-        "pit_share": block.pit_share,
-    }
+    } | _same(block, "face", "smooth_mm", "stiff", "pit", "pit_share")
 
 
 def _pairs(lines: Tensor) -> Tensor:
@@ -359,13 +342,5 @@ def contact_values(block: nn.Module, size: tuple[int, int]) -> Values:
         "contact_decay": block.decay_mm,
         "contact_by_frame": block.by_frame,
         "contact_steps": block.steps,
-        "pull": block.pull,
-        "pulling": block.pulling,
-        "least_deep": block.least_deep,
-        "share": block.share,
-        "large": block.large,
-        "deep": block.deep,
         "rim_reach": pressure_module.rim_reach(block.rim_mm, pitch),
-        "fall": block.fall,
-        "least_depth": block.least_depth,
-    }
+    } | _same(block, "pull", "pulling", "least_deep", "share", "large", "deep", "fall", "least_depth")

@@ -48,9 +48,6 @@ MOST_OF_12_BITS = 4095
 MOST_BYTES = 2**29
 """A larger image file is not read."""
 
-MOST_PAGES = 10**5
-"""Pages of a TIFF that are looked for."""
-
 MOST_TENSOR_BYTES = 2**31
 """A larger file of tensors is not read."""
 
@@ -229,30 +226,12 @@ def _check_still(path: Path) -> None:
 
 
 def count_pages(path: Path) -> int:
-    """Number of pages that a TIFF announces, of which the last may be cut short; 1 for other files."""
+    """Number of pages of a TIFF, of which the last may be cut short; 1 for other files."""
+    import cv2
+
     if path.suffix.lower() not in PAGED_SUFFIXES or not path.is_file():
         return 1
-    found: list[int] = []
-    with path.open("rb") as stream:
-        head = stream.read(16)
-        order, size = {b"II": "<", b"MM": ">"}.get(head[:2], ""), path.stat().st_size
-        if not order or len(head) < 16 or struct.unpack(f"{order}H", head[2:4])[0] not in (42, 43):
-            return 1
-        large = struct.unpack(f"{order}H", head[2:4])[0] == 43  # BigTIFF
-        number, entry, pointer = ("Q", 20, "Q") if large else ("H", 12, "I")
-        (place,) = struct.unpack_from(f"{order}{pointer}", head, 8 if large else 4)
-        while place and place not in found and len(found) < MOST_PAGES:
-            found.append(place)
-            stream.seek(min(place, size))
-            counted = stream.read(struct.calcsize(number))
-            if len(counted) < struct.calcsize(number):
-                break
-            stream.seek(entry * min(struct.unpack(f"{order}{number}", counted)[0], size), 1)
-            following = stream.read(struct.calcsize(pointer))
-            if len(following) < struct.calcsize(pointer):
-                break
-            (place,) = struct.unpack(f"{order}{pointer}", following)
-    return max(1, len(found))
+    return max(1, cv2.imcount(check_text_name("path", path)))
 
 
 def check_colour(pixels: Pixels | None, path: Path) -> Pixels:
@@ -337,7 +316,8 @@ def check_pixels(name: str, pixels: object) -> None:
         kind = f"an array of {pixels.dtype}" if isinstance(pixels, np.ndarray) else type(pixels).__name__
         raise TypeError(f"{name}: expected an array of uint8 or uint16, got {kind}: pixels.astype(np.uint8) of values 0 to 255")
     if pixels.ndim != 3 or pixels.shape[2] != 3 or pixels.size == 0:
-        raise ValueError(f"{name}: expected (H, W, 3), B, G, R, got {pixels.shape}: not in colour?")
+        cause = "channels stand first: an image of torchvts already?" if pixels.shape[:1] == (3,) else "not in colour?"
+        raise ValueError(f"{name}: expected (H, W, 3), B, G, R, got {pixels.shape}: {cause}")
 
 
 def rgb_from_bgr(pixels: Pixels) -> Tensor:

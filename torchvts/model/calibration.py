@@ -44,6 +44,9 @@ DEFECT_WINDOW_PX = 7
 PEDESTAL = 0.03
 """Added to image and background before response fields take their ratio: where an LED does not reach, a ratio is all noise."""
 
+LIGHTS = ("light_position_mm", "light_albedo", "light_gloss")
+"""Tensors of a file by lights: the arguments of :class:`PointLights`."""
+
 UNKNOWN_NOISE = 0.003
 """Noise in image value, three quarters of a grey level, of a camera of which there is no image."""
 
@@ -174,8 +177,8 @@ class Calibration:
             ValueError, TypeError: background or ambient of another shape or range.
         Example:
             >>> lights = PointLights([[20, 0, 30], [-10, 17, 30], [-10, -17, 30]], [900, 900, 900])
-            >>> Calibration.from_lights(lights, Sensor("rig", 48, 64, 0.5)).compensation.abs().max()
-            tensor(0.)
+            >>> Calibration.from_lights(lights, Sensor("rig", 48, 64, 0.5)).measured
+            False
         """
         check_record("lights", lights, PointLights, "PointLights(position_mm, albedo) makes them")
         check_sensor("sensor", sensor)
@@ -348,11 +351,6 @@ class Calibration:
         return inverse_light_matrix(depth, self.lights.position_mm, self.lights.albedo, self.sensor.mm_per_pixel)[0]
 
     @cached_property
-    def compensation(self) -> Tensor:
-        """I_delta = model - background, (3, H, W), linear light (eq. 7-8 of the paper)."""
-        return self.model_image - self.background
-
-    @cached_property
     def defects(self) -> Tensor:
         """(H, W) bool: pixels whose background is far from the lights' model, or for a response field from the median around them.
 
@@ -421,10 +419,10 @@ class Calibration:
     def save(self, path: str | Path) -> None:
         """Write one safetensors file, whole or not at all.
 
-        Tensors by lights: S, rho, I_delta, the inverse light matrix, the background, the noise, and ambient light if there is
-        any. Tensors by response: the noise, the background as a 16-bit PNG of the camera's values, which keeps an 8-bit image bit
-        for bit, and the upper triangle of the covariance, if there is one. Where markers are printed, the image with them, as such
-        a PNG. JSON metadata: format version, sensor, response, markers, report.
+        Tensors by lights: S, rho, gloss, the background, the noise, and ambient light if there is any. Tensors by response: the
+        noise, the background as a 16-bit PNG of the camera's values, which keeps an 8-bit image bit for bit, and the upper triangle
+        of the covariance, if there is one. Where markers are printed, the image with them, as such a PNG. JSON metadata: format
+        version, sensor, response, markers, report.
         """
         metadata = {
             "format_version": FORMAT_VERSION,
@@ -446,14 +444,8 @@ class Calibration:
                 row, column = torch.triu_indices(*self.covariance.shape)
                 tensors["covariance"] = self.covariance[row, column]
         else:
-            tensors |= {
-                "light_position_mm": self.lights.position_mm,
-                "light_albedo": self.lights.albedo,
-                "light_gloss": self.lights.gloss,
-                "background": self.background,
-                "compensation": self.compensation,
-                "inverse": self.inverse,
-            }
+            tensors |= dict(zip(LIGHTS, (self.lights.position_mm, self.lights.albedo, self.lights.gloss), strict=True))
+            tensors["background"] = self.background
             if self.ambient is not None:
                 tensors["ambient"] = self.ambient
         save_tensors(path, tensors, metadata)
@@ -475,13 +467,10 @@ class Calibration:
                 f"{path}: expected format version {FORMAT_VERSION}, got {brief(version)}: written by another torchvts; "
                 "calibrate again, or update torchvts"
             )
-        sensor = Sensor.from_dict(metadata.get("sensor"), str(path))
-        if not isinstance(metadata.get("measured"), bool):
-            raise ValueError(f"{path}: measured: expected true or false, got {brief(metadata.get('measured'))}: damaged metadata")
-        read_report(metadata.get("report"), f"{path}: report")
-        if metadata.get("response") is not None:
-            return _load_by_response(path, tensors, metadata, sensor)
-        return _load_by_lights(path, tensors, metadata, sensor)
+        try:
+            return _of_file(tensors, metadata)
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"{path}: {error}") from error
 
 
 def check_calibration(name: str, value: object) -> None:
@@ -503,101 +492,39 @@ def _measure(background: Tensor, sensor: Sensor, dtype: torch.dtype) -> tuple[Te
     return image if sensor.exponent == 1.0 else image**sensor.exponent, noise, markers, printed
 
 
-def _load_by_response(path: str | Path, tensors: dict[str, Tensor], metadata: dict[str, Any], sensor: Sensor) -> Calibration:
-    response = ResponseModel.from_dict(metadata["response"], f"{path}: response")
-    markers = _load_markers(path, metadata)
-    _check_tensors(path, tensors, {"noise_std": (3,)})
-    if "background_png" not in tensors:
-        raise ValueError(f"{path}: tensor 'background_png' is missing")
-    value = image_from_bytes(tensors["background_png"], (sensor.height, sensor.width), f"{path}: tensor 'background_png'")
-    light = value.to(tensors["noise_std"].dtype) ** sensor.exponent
-    if (sensor.exponent, sensor.blur_px) != (response.gamma, response.blur_px):
-        raise ValueError(f"{path}: sensor and response differ in gamma or blur_px: damaged or edited")
-    noise, measured, report = tensors["noise_std"], metadata["measured"], metadata["report"]
-    covariance = _load_covariance(path, tensors, response.field.size())
-    contact = _load_contact(path, metadata)
-    printed = _load_printed(path, tensors, sensor)
-    return Calibration(sensor, None, light, noise, measured, report, response, markers, None, *contact, covariance, printed)
-
-
-def _load_by_lights(path: str | Path, tensors: dict[str, Tensor], metadata: dict[str, Any], sensor: Sensor) -> Calibration:
-    markers = _load_markers(path, metadata)
-    size = (3, sensor.height, sensor.width)
-    expected: dict[str, tuple[int, ...]] = {
-        "light_position_mm": (3, 3), "light_albedo": (3,), "light_gloss": (3,), "noise_std": (3,),
-        "background": size, "compensation": size, "inverse": (3, *size),
-    }  # fmt: skip
-    if "ambient" in tensors:
-        expected["ambient"] = (3,)
-    _check_tensors(path, tensors, expected)
-    try:
-        lights = PointLights(*(tensors[f"light_{part}"] for part in ("position_mm", "albedo", "gloss"))).requires_grad_(False)
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
-    background, noise, ambient = tensors["background"], tensors["noise_std"], tensors.get("ambient")
-    calibration = Calibration(
-        sensor,
-        lights,
-        background,
-        noise,
-        metadata["measured"],
-        metadata["report"],
-        None,
-        markers,
-        ambient,
-        *_load_contact(path, metadata),
-        printed=_load_printed(path, tensors, sensor),
-    )
-    for name, derived in (("compensation", calibration.compensation), ("inverse", calibration.inverse)):
-        if not torch.allclose(tensors[name], derived, rtol=1e-3, atol=1e-3 * float(derived.abs().max())):
-            raise ValueError(f"{path}: tensor {name!r} does not fit the lights in the same file: damaged or edited")
-    return calibration
-
-
-def _load_covariance(path: str | Path, tensors: dict[str, Tensor], size: int) -> Tensor | None:
-    """The symmetric matrix of an upper triangle; None where the file has none."""
-    if "covariance" not in tensors:
-        return None
-    _check_tensors(path, tensors, {"covariance": (size * (size + 1) // 2,)})
-    covariance = torch.zeros(size, size, dtype=tensors["covariance"].dtype)
-    row, column = torch.triu_indices(size, size)
-    covariance[row, column] = covariance[column, row] = tensors["covariance"]
-    if not bool((covariance.diagonal() > 0).all()):
-        raise ValueError(f"{path}: tensor 'covariance': expected a positive diagonal: damaged")
-    return covariance
-
-
-def _load_markers(path: str | Path, metadata: dict[str, Any]) -> FillMarkers | None:
-    return None if metadata.get("markers") is None else FillMarkers.from_dict(metadata["markers"], f"{path}: markers")
-
-
-def _load_printed(path: str | Path, tensors: dict[str, Tensor], sensor: Sensor) -> Tensor | None:
-    if "printed_png" not in tensors:
-        return None
-    return image_from_bytes(tensors["printed_png"], (sensor.height, sensor.width), f"{path}: tensor 'printed_png'").float()
-
-
-def _load_contact(path: str | Path, metadata: dict[str, Any]) -> tuple[float | None, float | None]:
-    """Share and L of contact, each None where no press showed it."""
-    share, decay_mm = metadata.get("contact_share"), metadata.get("contact_decay_mm")
-    try:
-        return (
-            None if share is None else check_positive(f"{path}: contact_share", share, 1.0),
-            None if decay_mm is None else check_decay(f"{path}: contact_decay_mm", decay_mm),
-        )
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{error}: damaged metadata") from None
-
-
-def _check_tensors(path: str | Path, tensors: dict[str, Tensor], expected: dict[str, tuple[int, ...]]) -> None:
-    for name, shape in expected.items():
+def _of_file(tensors: dict[str, Tensor], metadata: dict[str, Any]) -> Calibration:
+    """The calibration of a file, whose values its constructor checks as those of a user."""
+    sensor = Sensor.from_dict(metadata.get("sensor"), "sensor")
+    by_lights = metadata.get("response") is None
+    for name in ("noise_std", *((*LIGHTS, "background") if by_lights else ("background_png",))):
         if name not in tensors:
-            raise ValueError(f"{path}: tensor {name!r} is missing")
-        if tuple(tensors[name].shape) != shape or not tensors[name].is_floating_point():
-            raise ValueError(
-                f"{path}: tensor {name!r}: expected {shape} floats, got {tuple(tensors[name].shape)} {tensors[name].dtype}"
-            )
-        if not bool(torch.isfinite(tensors[name]).all()):
-            raise ValueError(f"{path}: tensor {name!r}: expected finite values, got NaN or infinite ones")
-    if not bool((tensors["noise_std"] > 0).all()):
-        raise ValueError(f"{path}: tensor 'noise_std': expected values above 0")
+            raise ValueError(f"tensor {name!r} is missing")
+    named = ("measured", "report", "contact_share", "contact_decay_mm")
+    parts: dict[str, Any] = {name: metadata.get(name) for name in named} | {"noise_std": tensors["noise_std"]}
+    if metadata.get("markers") is not None:
+        parts["markers"] = FillMarkers(**metadata["markers"])
+    images = {
+        name: image_from_bytes(tensors[name], (sensor.height, sensor.width), f"tensor {name!r}")
+        for name in ("background_png", "printed_png")
+        if name in tensors
+    }
+    if "printed_png" in images:
+        parts["printed"] = images["printed_png"].float()
+    if by_lights:
+        lights = PointLights(*(tensors[name] for name in LIGHTS)).requires_grad_(False)
+        return Calibration(sensor, lights, tensors["background"], ambient=tensors.get("ambient"), **parts)
+    response = ResponseModel.from_dict(metadata["response"], "response")
+    if (sensor.exponent, sensor.blur_px) != (response.gamma, response.blur_px):
+        raise ValueError("sensor and response differ in gamma or blur_px: damaged or edited")
+    light = images["background_png"].to(tensors["noise_std"].dtype) ** sensor.exponent
+    covariance = _symmetric(tensors["covariance"], response.field.size()) if "covariance" in tensors else None
+    return Calibration(sensor, None, light, response=response, covariance=covariance, **parts)
+
+
+def _symmetric(triangle: Tensor, size: int) -> Tensor:
+    """The matrix (size, size) of an upper triangle."""
+    check_shape("covariance", triangle, (size * (size + 1) // 2,), "the triangle of its field")
+    matrix = triangle.new_zeros(size, size)
+    row, column = torch.triu_indices(size, size)
+    matrix[row, column] = matrix[column, row] = triangle
+    return matrix

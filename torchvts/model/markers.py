@@ -11,7 +11,6 @@ import torch
 from torch import Tensor, nn
 
 from ..core.checks import (
-    brief,
     check_batch,
     check_field,
     check_integer,
@@ -245,21 +244,8 @@ class FillMarkers(nn.Module):
         return fill_markers(image, find_markers(image, self.diameter_px, self.contrast, self.sigmas, self.margin))
 
     def to_dict(self) -> dict[str, float]:
-        """Plain numbers; :meth:`from_dict` reads them back."""
+        """The arguments."""
         return {name: getattr(self, name) for name in ("diameter_px", "contrast", "sigmas", "margin")}
-
-    @classmethod
-    def from_dict(cls, values: object, source: str) -> "FillMarkers":
-        """Make the block from the output of :meth:`to_dict`; ``source`` names it in errors."""
-        if not isinstance(values, dict):
-            raise ValueError(f"{source}: expected keys and values, got {type(values).__name__}")
-        for key in values:
-            if key not in ("diameter_px", "contrast", "sigmas", "margin"):
-                raise ValueError(f"{source}: key {brief(key)}: unknown; expected diameter_px, contrast, sigmas, margin")
-        try:
-            return cls(**values)
-        except (TypeError, ValueError) as error:
-            raise ValueError(f"{source}: {error}") from error
 
     def extra_repr(self) -> str:
         return ", ".join(f"{name}={value:.3g}" for name, value in self.to_dict().items())

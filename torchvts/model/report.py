@@ -85,18 +85,9 @@ class Report(_ReportKeys, total=False):
         stated_deg: error of normals to expect anywhere on the skin, degrees: by the covariance, or the record of a prior alone.
         prior_deg: where the sensor's prior is the model, or what presses were fitted from: its mean error on presses and units that
             it was not fitted to, degrees; None where its file does not say.
-        family: of the lights, in words.
         converged: whether the fit of the lights converged.
-        message: how that fit ended, and what to do if it did not converge.
-        steps: its number of steps.
-        loss: its last loss.
-        gamma: camera response of the lights.
         direction_std_deg: (3,), standard deviation of each light's direction, degrees.
-        position_std_mm: (3, 3), standard deviation of each coordinate, mm.
         misfit: (3,), size of the smooth pattern in the background that the lights cannot explain, relative to the light.
-        inlier_fraction: share of the pixels that the robust fit kept.
-        gloss: (3,), strength of the specular lobe.
-        residual_std: (3,), robust standard deviation of background minus model, linear light.
         camera_height_mm: height of a pinhole camera above the skin, where it is known.
     """
 
@@ -109,18 +100,9 @@ class Report(_ReportKeys, total=False):
     own_deg: float
     stated_deg: float
     prior_deg: float | None
-    family: str
     converged: bool
-    message: str
-    steps: int
-    loss: float
-    gamma: float
     direction_std_deg: list[float]
-    position_std_mm: list[list[float]]
     misfit: list[float]
-    inlier_fraction: float
-    gloss: list[float]
-    residual_std: list[float]
     camera_height_mm: float
 
 

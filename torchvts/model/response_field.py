@@ -121,21 +121,6 @@ class ResponseField(Terms, _Coefficients):
             start += len(basis)
         return torch.stack(maps)
 
-    def colour(self) -> float:
-        """Change of colour over change of light that slopes make: RMS of R - G and B - G over that of R, G and B, all relative.
-
-        Of the smallest changes of light with these slopes, over all directions of slope and a square of the image. White light
-        would make 0, channels that change independently of one another 1.4.
-
-        Example:
-            >>> round(ResponseField(0, -1, 10.0, ((1, 0, 0), (0, 1, 0))).colour(), 2)
-            1.5
-        """
-        weight = self.maps(9, 9, 2.0 * self.half_mm / 9)[:3].permute(2, 3, 1, 0)  # (9, 9, 2, 3)
-        change = torch.linalg.pinv(weight)  # (9, 9, 3, 2)
-        difference = change[..., (0, 2), :] - change[..., 1:2, :]
-        return float((difference.square().mean() / change.square().mean().clamp_min(1e-30)).sqrt())
-
     def embedded(self, degree: int, product_degree: int, cubic_degree: int = -1) -> "ResponseField":
         """The same field as a member of a larger family; the new coefficients are zero.
 
@@ -240,7 +225,6 @@ class ResponseModel:
             values["field"] = ResponseField.from_dict(values["field"], f"{source}: field")
         if values.get("by_depth") is not None:
             values["by_depth"] = DepthBrightness.from_dict(values["by_depth"], f"{source}: by_depth")
-        values.pop("taught", None)  # older files say how steep and deep their presses were
         return from_dict(cls, values, source)
 
 

@@ -192,22 +192,10 @@ class NormalFromMLP(NormalModel):
             state, described = load_tensors(path)
             if described.get("kind") != MLP_KIND or "flat" not in state or described.get("output") not in OUTPUTS:
                 raise ValueError(f"{path}: expected a network that NormalFromMLP.save wrote, got {described.get('kind')!r}")
-            try:
-                check_choice("input_domain", described.get("input_domain", "image"), tuple(DOMAINS))
-                check_least("blur_px", described.get("blur_px", 0.0))
-            except (TypeError, ValueError) as error:
-                raise ValueError(f"{path}: damaged: {error}") from error
             stored = state.pop("flat")
-            if flat is None:
-                flat = stored
-                try:
-                    check_field("flat", flat)
-                    check_range("flat", flat)
-                except (TypeError, ValueError) as error:
-                    raise ValueError(f"{path}: damaged: {error}") from error
+            flat = stored if flat is None else flat
         else:
             state = _read_state(path)
-        domain, blur_px = str(described.get("input_domain", "image")), described.get("blur_px", 0.0)
         if flat is None:
             raise ValueError(
                 "flat: expected the image of the flat skin, (3, H, W), got None: a bare state dict holds none; "
@@ -215,9 +203,9 @@ class NormalFromMLP(NormalModel):
             )
         check_flat_shape(flat)
         weights = _check_state(path, state)
-        widths = [weight.shape[0] for weight, _ in weights[:-1]]
-        kind = output or str(described.get("output", "angle"))
-        block = cls(flat.shape[1], flat.shape[2], flat, widths, output=kind, input_domain=domain, blur_px=blur_px)
+        options: dict[str, Any] = {name: described[name] for name in ("output", "input_domain", "blur_px") if name in described}
+        options |= {} if output is None else {"output": output}
+        block = cls(flat.shape[1], flat.shape[2], flat, [weight.shape[0] for weight, _ in weights[:-1]], **options)
         block._set_weights(weights)
         return block.requires_grad_(False).eval()
 

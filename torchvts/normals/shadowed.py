@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from ..core.checks import check_shape, may_read, may_read_values
-from ..core.geometry import gradient_from_normal, normal_from_gradient, slope_beside_cliff
+from ..core.geometry import gradient_from_normal, normal_from_gradient, slope_of_depth
 from ..core.noise import dark_below
 from ..model.lights import glossy_light, light_matrix, seen_at
 
@@ -232,9 +232,9 @@ class ShadowedPixels(nn.Module):
         start = torch.where((failed.any(dim=1)[b] | self.ill_conditioned[row, column])[:, None], torch.zeros_like(start), start)
         z = torch.zeros_like(start[:, 0])
         if depth_mm is not None:  # its neighbours enter through it
-            depth = depth_mm[:, 0].expand(image.shape[0], image.shape[2], image.shape[3])
-            z = depth[b, row, column]
-            start = _slope_at(depth, b, row, column, view.mm_per_pixel)
+            depth = depth_mm.expand(image.shape[0], 1, image.shape[2], image.shape[3])
+            z = depth[b, 0, row, column]
+            start = slope_of_depth(depth, view.mm_per_pixel)[b, :, row, column]
         x = (column.to(normal.dtype) - 0.5 * (image.shape[3] - 1)) * view.mm_per_pixel
         y = (row.to(normal.dtype) - 0.5 * (image.shape[2] - 1)) * view.mm_per_pixel
         if depth_mm is not None:
@@ -320,14 +320,3 @@ def _places(wanted: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         return place // (height * width), pixel // width, pixel % width
     b, row, column = torch.where(wanted)
     return b, row, column
-
-
-def _slope_at(depth_mm: Tensor, b: Tensor, row: Tensor, column: Tensor, mm_per_pixel: float) -> Tensor:
-    """:func:`~torchvts.core.geometry.slope_of_depth` of a depth (B, H, W) at N pixels, (N, 2)."""
-    height, width = depth_mm.shape[1], depth_mm.shape[2]
-    z = depth_mm[b, row, column]
-    left, right = depth_mm[b, row, (column - 1).clamp_min(0)], depth_mm[b, row, (column + 1).clamp_max(width - 1)]
-    above, below = depth_mm[b, (row - 1).clamp_min(0), column], depth_mm[b, (row + 1).clamp_max(height - 1), column]
-    p = slope_beside_cliff((z - left) / mm_per_pixel, (right - z) / mm_per_pixel)
-    q = slope_beside_cliff((z - above) / mm_per_pixel, (below - z) / mm_per_pixel)
-    return torch.stack((p, q), dim=1)

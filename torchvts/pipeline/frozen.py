@@ -287,7 +287,7 @@ def values_of(pipe: DepthPipeline) -> dict[str, Any]:
     compiled.check_equal("normals.mm_per_pixel", values["mm_per_pixel"], pipe.mm_per_pixel)
     values["metric"] = pipe._metric
     values |= compiled.compensate_values(pipe.compensate, size)
-    values |= compiled.solver_values("integrate", solve.integrate, values)
+    compiled.check_solver("integrate", solve.integrate, pipe.mm_per_pixel)
     values |= compiled.mask_values(pipe.mask, size, pipe.takes_slopes)
     values |= compiled.zero_values(solve.zero, size) | compiled.contact_values(pipe.contact, size)
     check_block("slopes", pipe.slopes, SlopesOfDepth, SlopesOfPixels)

@@ -147,7 +147,7 @@ uint8_t *with_background(const Plan *old, const float *image, const char *about,
         }
         square += median(some, some + pixels, pixels) / 3.0;
     }
-    p->background = light, p->gain = gain, p->offset = NULL, p->per_light = per_light;
+    p->background = light, p->gain = gain, p->per_light = per_light;
     p->pedestal = (float[3]){(float)PEDESTAL, (float)PEDESTAL, (float)PEDESTAL};
     p->saturation_light = pow(SATURATED, p->exponent) - 3.0 * most;
     p->exact = fmax(EXACT, 0.5 * sqrt(2.0 * square) / (p->relight_stride < 3 ? 1.0 : 3.0));

@@ -12,19 +12,12 @@ WIDE void linearise(const Plan *plan, const float *image, float *light) {
     }
 }
 
-/* image * gain + offset, either of which may be null; without offset image * gain + pedestal * gain. */
-WIDE static void multiply_add(const float *restrict image, const float *restrict gain, const float *restrict offset, float pedestal, int n,
-                              float *restrict light) {
-    if (gain && !offset && pedestal != 0.0f)
+/* (image + pedestal) * gain, which may be null for 1. */
+WIDE static void multiply_add(const float *restrict image, const float *restrict gain, float pedestal, int n, float *restrict light) {
+    if (gain)
         for (int x = 0; x < n; x++) light[x] = image[x] * gain[x] + pedestal * gain[x];
-    else if (gain && offset)
-        for (int x = 0; x < n; x++) light[x] = image[x] * gain[x] + offset[x];
-    else if (gain)
-        for (int x = 0; x < n; x++) light[x] = image[x] * gain[x];
-    else if (offset)
-        for (int x = 0; x < n; x++) light[x] = image[x] + offset[x];
     else
-        memcpy(light, image, sizeof(float) * (size_t)n);
+        for (int x = 0; x < n; x++) light[x] = image[x] + pedestal;
 }
 
 /* The sum of an odd number of lines, each times its weight, in their order; seven, six and two at a time, which stay in registers. Fused, as
@@ -62,15 +55,15 @@ WIDE FUSED static void weighted_sum(const float *const *lines, const float *rest
     }
 }
 
-/* What is done to a plane: image * gain + offset, either of which may be null. */
+/* What is done to a plane: (image + pedestal) * gain. */
 typedef struct {
-    const float *image, *gain, *offset;
+    const float *image, *gain;
     float pedestal;
 } Affine;
 
 /* n values from `at` on. */
 static void apply(const Affine *of, size_t at, int n, float *light) {
-    multiply_add(of->image + at, of->gain ? of->gain + at : NULL, of->offset ? of->offset + at : NULL, of->pedestal, n, light);
+    multiply_add(of->image + at, of->gain ? of->gain + at : NULL, of->pedestal, n, light);
 }
 
 /* Has the processor fetch what apply() will read: rows are too short for it to see by itself where they go on. */
@@ -78,7 +71,6 @@ static void ahead(const Affine *of, size_t at, int n) {
     for (int x = 0; x < n; x += 16) {
         FETCH(of->image + at + x);
         if (of->gain) FETCH(of->gain + at + x);
-        if (of->offset) FETCH(of->offset + at + x);
     }
 }
 
@@ -189,7 +181,7 @@ int compensate(const Plan *plan, Scratch *scratch, const float *image, float *te
     for (int c = 0; c < 3 && code == DONE; c++, image += pixels, light += pixels) {
         const size_t at = pixels * (size_t)c;
         if (lit) relight(plan, image, plan->background + at, terms + 6 * c, relit);
-        Affine affine = {lit ? relit : image, plan->gain ? plan->gain + at : NULL, plan->offset ? plan->offset + at : NULL, plan->pedestal[c]};
+        Affine affine = {lit ? relit : image, plan->gain ? plan->gain + at : NULL, plan->pedestal[c]};
         if (plan->defects || !taps) {
             float *to = filled ? whole : light;
             apply(&affine, 0, (int)pixels, to);

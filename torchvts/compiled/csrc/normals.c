@@ -20,13 +20,12 @@ typedef struct {
     float place[3][3], table[3][6], plane[3], volume;
 } Lights;
 
-/* One row at a known depth, from where the first pixel sees the undeformed skin. */
+/* One row at a known depth, from the place of the first pixel. */
 WIDE static void at_depth(const float *restrict image, size_t step, const float *restrict depth, const Lights *restrict lights, float first_x,
-                          float row_y, float pitch, float per_height, int n, float *restrict nx, float *restrict ny, float *restrict nz) {
+                          float y, float pitch, int n, float *restrict nx, float *restrict ny, float *restrict nz) {
     const Lights at = *lights;
     for (int k = 0; k < n; k++) {
-        const float z = depth[k], nearer = z * per_height, rest_x = first_x + pitch * (float)k;
-        const float x = rest_x - rest_x * nearer, y = row_y - row_y * nearer;
+        const float z = depth[k], x = first_x + pitch * (float)k;
         float sums[6] = {0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f};
         for (int j = 0; j < 3; j++) {
             const float a = x - at.place[j][0], b = y - at.place[j][1], c = z - at.place[j][2];
@@ -86,7 +85,7 @@ static void by_lights(const Plan *plan, const float *light, const float *depth, 
         float *to = normal + at;
         if (depth)
             at_depth(light + at, pixels, depth + at, &lights, -0.5f * (float)(width - 1) * pitch, ((float)y - 0.5f * (float)(height - 1)) * pitch, pitch,
-                     (float)plan->per_camera_height, width, to, to + pixels, to + 2 * pixels);
+                     width, to, to + pixels, to + 2 * pixels);
         else
             from_inverse(light + at, pixels, plan->inverse + at, pixels, width, to, to + pixels, to + 2 * pixels);
         for (int c = 0; c < 3; c++)

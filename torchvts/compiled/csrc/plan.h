@@ -27,7 +27,7 @@ enum { MOST_SIDE = 16384, MOST_PIXELS = 1 << 26, MOST_TAPS = 1025, MOST_WAVES = 
     REAL(marker_diameter, 0) REAL(marker_contrast, 0) REAL(marker_sigmas, 0) REAL(marker_margin, 0)                                           \
     /* compensate.c; light is value^exponent; light of the values k / (lights - 1), or none; maps (3, height, width); defect (defects), neighbours (.., 4) */          \
     REAL(exponent, 1e-9) INTEGER(lights, 0, 1 << 20) TABLE(float, light_of, p->lights)                                                                             \
-    OPTION(float, gain, 3 * PIXELS) OPTION(float, offset, 3 * PIXELS) TABLE(float, pedestal, 3)                                               \
+    OPTION(float, gain, 3 * PIXELS) TABLE(float, pedestal, 3)                                                                                 \
     INTEGER(defects, 0, MOST_PIXELS) TABLE(int64_t, defect, p->defects) TABLE(int64_t, neighbours, 4 * p->defects)                            \
     INTEGER(blur_taps, 0, MOST_TAPS) TABLE(float, blur, p->blur_taps)                                                                         \
     /* light.c; background (3, height, width), skin (3, samples), share (3, padded), place (3, 6, padded), terms (3, 6, 6), scales (steps),   \
@@ -44,9 +44,9 @@ enum { MOST_SIDE = 16384, MOST_PIXELS = 1 << 26, MOST_TAPS = 1025, MOST_WAVES = 
     /* normals.c and shadowed.c; maps (3, height, width), inverse (3, 3, height, width), position (3, 3), albedo (3) */                       \
     INTEGER(by_lights, 0, 1) TABLE(float, inverse, BY_LIGHTS(9 * PIXELS)) TABLE(float, flat_light, BY_LIGHTS(3 * PIXELS))                     \
     TABLE(float, saturated_above, BY_LIGHTS(3 * PIXELS)) TABLE(uint8_t, ill_conditioned, BY_LIGHTS(PIXELS))                                   \
-    INTEGER(any_ill_conditioned, 0, 1) TABLE(float, position, BY_LIGHTS(9)) TABLE(float, albedo, BY_LIGHTS(3)) REAL(per_camera_height, 0)     \
+    INTEGER(any_ill_conditioned, 0, 1) TABLE(float, position, BY_LIGHTS(9)) TABLE(float, albedo, BY_LIGHTS(3))                                \
     TABLE(float, noise_std, BY_LIGHTS(3)) REAL(prior_std, 0) REAL(brightness_noises, 0) REAL(least_brightness, 0)                             \
-    INTEGER(shadow_steps, 0, MOST_STEPS) REAL(cliff_slope, 0) REAL(start_slope, 0) REAL(left_out, -1e12) REAL(failed_share, 0)                \
+    INTEGER(shadow_steps, 0, MOST_STEPS) REAL(cliff_slope, 0) REAL(start_slope, 0) REAL(failed_share, 0)                                       \
     /* response.c; field_place (width), field (height, degree + 1, 2, terms), per_mm (height, 3, 3) */                                        \
     INTEGER(degree, 0, 6) INTEGER(terms, 0, 19) TABLE(float, field_place, BY_RESPONSE(p->width))                                              \
     TABLE(float, field, BY_RESPONSE(2 * p->height * (p->degree + 1) * p->terms)) OPTION(float, per_mm, BY_RESPONSE(9 * p->height))            \
@@ -73,8 +73,6 @@ enum { MOST_SIDE = 16384, MOST_PIXELS = 1 << 26, MOST_TAPS = 1025, MOST_WAVES = 
     REAL(share, 0) REAL(large, 0) REAL(deep, -1e12) INTEGER(rim_reach, 0, MOST_TAPS) REAL(fall, -1e12) REAL(least_depth, 0)
 
 #define SOLVE_FIELDS(INTEGER, REAL, TABLE, OPTION)                                                                                            \
-    /* poisson.c */                                                                                                                           \
-    INTEGER(zeroed, 0, 1)                                                                                                                     \
     /* frame.c */                                                                                                                             \
     INTEGER(passes, 1, MOST_STEPS) INTEGER(slopes_of_depth, 0, 1)
 

@@ -210,50 +210,6 @@ static void row_of_depth(const float *lanes, size_t step, int n, float *row) {
     for (int x = 0; x < n; x += LANES, lanes += step) memcpy(row + x, lanes, sizeof(float) * (size_t)least(LANES, n - x));
 }
 
-/* Sum of depth where the slopes are not zero, and how many pixels that are. */
-WIDE static double inclined_sum(const float *restrict depth, const float *restrict p, const float *restrict q, int n, int32_t *count) {
-    double sums[LANES] = {0.0}, total = 0.0;
-    int some = 0, x = 0;
-    for (; x + LANES <= n; x += LANES) {
-        float kept[LANES];
-        for (int t = 0; t < LANES; t++) {
-            const int is = (p[x + t] != 0.0f) | (q[x + t] != 0.0f);
-            kept[t] = (float)is * depth[x + t]; /* no branch, which the compiler would not vectorise */
-            some += is;
-        }
-        for (int t = 0; t < LANES; t++) sums[t] += kept[t];
-    }
-    for (int t = 0; x < n; x++, t++) {
-        const int is = (p[x] != 0.0f) | (q[x] != 0.0f);
-        sums[t] += is ? depth[x] : 0.0f;
-        some += is;
-    }
-    for (int t = 0; t < LANES; t++) total += sums[t];
-    *count += some;
-    return total;
-}
-
-/* The depth at which the gradient is zero on average, or where that is nowhere, the lowest. Depth has zero mean. */
-static float level_of(const float *gradient, const float *depth, int height, int width) {
-    const size_t pixels = (size_t)height * width;
-    double sum = 0.0;
-    size_t inclined = 0;
-    for (size_t at = 0; at < pixels; at += (size_t)width) {
-        int32_t count = 0;
-        sum += inclined_sum(depth + at, gradient + at, gradient + pixels + at, width, &count);
-        inclined += (size_t)count;
-    }
-    if (inclined < pixels) return (float)(-sum / (double)(pixels - inclined));
-    float level = depth[0];
-    for (size_t k = 1; k < pixels; k++)
-        if (depth[k] < level) level = depth[k];
-    return level;
-}
-
-WIDE static void lower(float *depth, float by, size_t n) {
-    for (size_t k = 0; k < n; k++) depth[k] -= by;
-}
-
 /* Memory of solve_one(): a double for each column; coefficients, and lines, those of the divergence, and then of depth, LINES columns after the other as
    transforms leave them (written to rows at once, each line of memory would be fetched for a part of a block); and of a transform: lines twice, and
    the coefficients of LINES columns. */
@@ -278,7 +234,7 @@ static void solve_one(const Solver *of, const float *gradient, float half_pitch,
 int integrate(const Plan *plan, Scratch *shared, const float *gradient, float *depth) {
     const int height = (int)plan->height, width = (int)plan->width;
     const Solver of = solver_of(height, width, plan->poisson);
-    const size_t wide = (size_t)of.wide, columns = (size_t)width + LINES, pixels = (size_t)height * width;
+    const size_t wide = (size_t)of.wide, columns = (size_t)width + LINES;
     const size_t coefficients = columns * wide, lines = columns * (size_t)height, scratch = cosine_scratch_size(height);
     const size_t taken = shared->used, bytes = sizeof(double) * (size_t)width + sizeof(float) * (coefficients + lines + scratch + wide * LINES);
     double *memory = lend(shared, bytes);
@@ -289,7 +245,6 @@ int integrate(const Plan *plan, Scratch *shared, const float *gradient, float *d
     const unsigned int before = without_tiny();
     solve_one(&of, gradient, 0.5f * (float)plan->mm_per_pixel, at, depth);
     with_tiny(before);
-    if (plan->zeroed) lower(depth, level_of(gradient, depth, height, width), pixels);
     give_back(shared, taken);
     return DONE;
 }

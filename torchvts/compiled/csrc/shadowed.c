@@ -78,9 +78,8 @@ static int failed_leds(const Plan *plan, const float *light, int failed[3]) {
 
 /* The light matrix at a pixel of depth z. */
 static void lights_at(const Plan *plan, int y, int x, float z, float rows[3][3]) {
-    const float pitch = (float)plan->mm_per_pixel, per_height = (float)plan->per_camera_height;
-    const float flat_x = ((float)x - 0.5f * (float)(plan->width - 1)) * pitch, flat_y = ((float)y - 0.5f * (float)(plan->height - 1)) * pitch;
-    const float see_x = flat_x - flat_x * z * per_height, see_y = flat_y - flat_y * z * per_height;
+    const float pitch = (float)plan->mm_per_pixel;
+    const float see_x = ((float)x - 0.5f * (float)(plan->width - 1)) * pitch, see_y = ((float)y - 0.5f * (float)(plan->height - 1)) * pitch;
     for (int j = 0; j < 3; j++) {
         const float *place = plan->position + 3 * j, to[3] = {place[0] - see_x, place[1] - see_y, place[2] - z};
         const float squared = to[0] * to[0] + to[1] * to[1] + to[2] * to[2], scale = plan->albedo[j] / (squared * sqrtf(squared));
@@ -112,7 +111,7 @@ void solve_shadowed(const Plan *plan, const float *light, const float *depth, fl
                 const float value = light[pixels * j + at];
                 const int is_saturated = value >= plan->saturated_above[pixels * j + at];
                 wanted |= is_saturated || is_dark(value, plan->flat_light[pixels * j + at], 3.0f * plan->noise_std[j]);
-                saturated[j] = is_saturated || failed[j] || value <= 0.5f * (float)plan->left_out;
+                saturated[j] = is_saturated || failed[j];
                 intensity[j] = failed[j] ? 0.0f : value;
             }
             if (!wanted) continue;

@@ -31,22 +31,29 @@ def test_results_have_their_fields_in_order():
     assert {"lights", "converged", "loss_history", "direction_std_deg", "message"} <= set(LightFit.__dataclass_fields__)
 
 
-def test_the_import_is_light():
-    """Beyond torch it loads three small packages, and neither Kornia nor torch's own compilers: 0.2 s where nothing else runs."""
-    program = "import sys, torch; before = set(sys.modules); import torchvts; print(*sorted(set(sys.modules) - before))"
-    loaded = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout.split()
-    packages = {name.split(".")[0] for name in loaded} - set(sys.stdlib_module_names)
+PROGRAM = """
+import runpy, sys, torch
+before = set(sys.modules)
+import torchvts as vts
+print(*sorted(set(sys.modules) - before))
+sys.argv = ["torchvts", "--version"]
+try:
+    runpy.run_module("torchvts", run_name="__main__")
+except SystemExit as stop:
+    print(stop.code, *({"cv2", "matplotlib", "open3d", "onnx"} & set(sys.modules)))
+from torchvts.model.lights import flat_image
+lights = vts.PointLights([[25, 0, 30], [-12, 20, 30], [-12, -20, 30]], [900, 900, 900])
+print(vts.calibrate(flat_image(lights, 24, 32, 1.2).detach(), vts.Sensor("rig", 24, 32, 1.2)).report["model"])
+print([name for name in sys.modules if name.startswith(("torch._dynamo", "torch._inductor"))])
+"""
+
+
+def test_import_command_and_calibration_load_no_more_than_they_need():
+    """The import, beyond torch, three small packages, and neither Kornia nor torch's own compilers: 0.2 s where nothing else runs."""
+    done = subprocess.run([sys.executable, "-W", "ignore", "-c", PROGRAM], capture_output=True, text=True, check=True)
+    by_import, *said = done.stdout.splitlines()
+    packages = {name.split(".")[0] for name in by_import.split()} - set(sys.stdlib_module_names)
     ours = {"torchvts", "safetensors", "yaml", "numpy", "cython_runtime"}
     assert {name for name in packages - ours if not name.startswith("_")} == set()
-    assert not [name for name in loaded if name.startswith(("torch._dynamo", "torch._inductor", "torch.onnx"))]
-
-
-def test_a_first_calibration_does_not_load_torchs_compilers():
-    program = (
-        "import sys; import torchvts as vts; from torchvts.model.lights import flat_image\n"
-        "lights = vts.PointLights([[25, 0, 30], [-12, 20, 30], [-12, -20, 30]], [900, 900, 900])\n"
-        "found = vts.calibrate(flat_image(lights, 24, 32, 1.2).detach(), vts.Sensor('rig', 24, 32, 1.2))\n"
-        "print(found.lights is not None, [name for name in sys.modules if name.startswith(('torch._dynamo', 'torch._inductor'))])"
-    )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    assert done.stdout.split() == ["True", "[]"]
+    assert not [name for name in by_import.split() if name.startswith(("torch._dynamo", "torch._inductor", "torch.onnx"))]
+    assert said == [f"torchvts {vts.__version__}", "0", "point_lights", "[]"]

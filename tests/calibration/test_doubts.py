@@ -27,7 +27,7 @@ def bare(presses, times=1.0):
     ]
 
 
-@pytest.mark.parametrize("times, expected", [(1.0, 0.63), (0.8, 0.77), (0.5, 1.2)])
+@pytest.mark.parametrize("times, expected", [(1.0, 0.63), pytest.param(0.8, 0.77, marks=pytest.mark.long), (0.5, 1.2)])
 def test_the_width_of_contacts_knows_nothing_of_the_given_diameter(times, expected):
     """Halved diameters double it; located contact radii stop at 0.95 of the ball's."""
     unit, contacts = by_presses(UNIT.background, UNIT.sensor, bare(UNIT.balls[:6], times), None)

@@ -345,7 +345,7 @@ def test_lights_are_tried_where_the_prior_is_left_out(prior):
     assert "one image constrains the lights to" in calibration.report["reason"]
 
 
-@pytest.mark.parametrize("count", [1, pytest.param(3, marks=pytest.mark.long), 5])
+@pytest.mark.parametrize("count", [*(pytest.param(few, marks=pytest.mark.long) for few in (1, 3)), 5])
 def test_presses_of_another_ball_do_no_harm_to_a_prior(prior, prior_alone, count):
     sensor = dataclasses.replace(GIVEN, prior=prior)
     calibration, warned = calibrate(background(seen_by_other_curve), sensor, other_presses(count))
@@ -379,12 +379,16 @@ def test_a_background_of_another_type_is_warned_of(prior):
 # known centers
 
 
-def test_known_centers_are_kept_and_their_radii_found(good, rest):
+def test_known_centers_are_kept_and_those_that_cannot_be_are_left_out(good, rest):
     known = [dataclasses.replace(p, center_px=in_px(c)) for p, c in zip(good, CENTERS_MM)]
     given = dataclasses.replace(good[0], center_px=[79.0, 60.0], contact_radius_px=12.0)
-    calibration, warned = calibrate(rest, GIVEN, [given, *known[1:4], *good[4:]])
+    odd = [dataclasses.replace(good[0], name=name, **one) for name, one in ODD.items()]
+    calibration, warned = calibrate(rest, GIVEN, [given, *known[1:4], *good[4:], *odd])
     rows = calibration.report["presses"]
-    assert warned == []
+    for row in rows[6:]:
+        assert not row["used"] and row["reason"] and any(text.startswith(f"{row['name']}: left out: ") for text in warned)
+    assert len(warned) == len(odd)
+    json.dumps(calibration.report, allow_nan=False)
     for row, press, depth in list(zip(rows, known, DEPTHS_MM))[1:4]:
         assert row["center_px"] == pytest.approx(press.center_px, abs=1e-9)
         assert row["contact_radius_px"] == pytest.approx(math.sqrt(BALL_MM * depth - depth**2) / PITCH, abs=1.5)
@@ -396,15 +400,6 @@ ODD = {
     "beside the contact": {"center_px": (5.0, 5.0)},
     "a radius below a pixel": {"center_px": in_px((0, 0)), "contact_radius_px": 0.1},
 }
-
-
-def test_a_center_that_cannot_be_is_left_out_with_a_reason(good, rest):
-    calibration, warned = calibrate(
-        rest, GIVEN, [*good[1:4], *(dataclasses.replace(good[0], name=name, **odd) for name, odd in ODD.items())]
-    )
-    for row in calibration.report["presses"][3:]:
-        assert not row["used"] and row["reason"] and any(text.startswith(f"{row['name']}: left out: ") for text in warned)
-    json.dumps(calibration.report, allow_nan=False)
 
 
 def test_a_single_press_with_an_impossible_center_is_refused(good, rest):
@@ -489,6 +484,7 @@ def test_good_presses_among_bad_ones_are_used(mixed, good, by_good):
     assert angle < 1.1 * depth_errors(by_good, seen_by_curve, ball, "fast", HELD_OUT)[1]
 
 
+@pytest.mark.long
 def test_two_wrong_diameters_among_seven_count_little(good, rest):
     wrong = [dataclasses.replace(p, ball_diameter_mm=12.0) for p in take_presses(count=8)[6:]]
     calibration, _ = calibrate(rest, GIVEN, good[:5] + wrong)
@@ -496,6 +492,7 @@ def test_two_wrong_diameters_among_seven_count_little(good, rest):
     assert min(weights[:5]) > 0.5 and max(weights[5:]) < 0.15
 
 
+@pytest.mark.long
 def test_two_sizes_exchanged_are_warned_of(rest):
     """Then half of the presses contradict the other half, and none of them stands out."""
     presses = [dataclasses.replace(p, ball_diameter_mm=(4.0, 9.0)[k % 2]) for k, p in enumerate(take_presses(count=10))]
@@ -554,7 +551,7 @@ def test_only_bad_presses_are_an_error_that_names_each(rest):
             call()
 
 
-@pytest.mark.parametrize("times", [0.5, 1.5])
+@pytest.mark.parametrize("times", [pytest.param(0.5, marks=pytest.mark.long), 1.5])
 def test_two_presses_that_contradict_each_other_are_not_metric(good, rest, times):
     wrong = dataclasses.replace(good[4], ball_diameter_mm=times * BALL_MM)
     unit, _ = calibrate(rest, GIVEN, [good[0], wrong])
@@ -589,7 +586,7 @@ def test_few_presses_move_what_a_prior_says_of_depth_by_little(known):
     assert moved > 0 and moved < 0.5 * (free - start).norm()
 
 
-@pytest.mark.parametrize("count", [1, 2, 5])
+@pytest.mark.parametrize("count", [1, 2, pytest.param(5, marks=pytest.mark.long)])
 def test_what_is_no_ball_counts_little_and_by_a_single_press_nothing_is_metric(good, rest, count):
     flat = vts.Press(seen_by_curve(vts.scenes.cylinder_press(3.0, 1.0, 6.0, 25.0, (1.0, -2.0), *SIZE), 40), BALL_MM, "a cylinder")
     unit, said = calibrate(rest, GIVEN, [*good[:count], flat])

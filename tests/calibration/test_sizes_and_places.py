@@ -57,6 +57,7 @@ def test_sizes_that_all_presses_contradict_are_refused_and_forced(mistake):
     assert any("contacts narrower than their balls, got 1." in text for text in warned)
 
 
+@pytest.mark.long
 def test_what_nothing_could_check_is_said_and_no_warning():
     smaller = [dataclasses.replace(press, ball_diameter_mm=0.8 * press.ball_diameter_mm) for press in bare()]
     unit, warned = calibrate(drawn().sensor, smaller)
@@ -74,7 +75,7 @@ def test_depth_by_presses_goes_with_the_square_of_a_wrong_pitch(whole, pitch_off
     sensor = dataclasses.replace(drawn().sensor, mm_per_pixel=pitch_off * drawn().sensor.mm_per_pixel)
     other, _ = calibrate(sensor, bare())
     right, wrong = (
-        [float(vts.DepthPipeline.from_calibration(unit)(press.image[None]).depth_mm.max()) for press in drawn().balls[:6]]
+        [float(vts.DepthPipeline.from_calibration(unit)(press.image[None]).depth_mm.max()) for press in drawn().balls[:6:2]]
         for unit in (whole[0], other)
     )
     ratio = sorted(b / a for a, b in zip(right, wrong, strict=True))[len(right) // 2]
@@ -118,7 +119,7 @@ def places():
     return [(press.name, press.center_px) for press in drawn().balls]
 
 
-@pytest.mark.parametrize("seed", [0, 2, *(pytest.param(seed, marks=pytest.mark.long) for seed in (1, 3, 4, 5))])
+@pytest.mark.parametrize("seed", [2, *(pytest.param(seed, marks=pytest.mark.long) for seed in (0, 1, 3, 4, 5))])
 def test_what_is_calibrated_can_be_saved_and_loaded(seed, tmp_path):
     """Odd presses among good ones: darker, saturated, twice, of another size, no contact. A refusal is an answer too."""
     generator = torch.Generator().manual_seed(seed)

@@ -2,8 +2,6 @@
 
 import dataclasses
 import importlib
-import subprocess
-import sys
 import warnings
 
 import pytest
@@ -32,16 +30,6 @@ def test_the_overview_names_every_command(capsys):
     assert len(text.splitlines()) <= 40
     assert all(f"  {name} " in text and what in text for name, what in COMMANDS.items())
     assert main([]) == 2
-
-
-def test_the_module_is_the_command_and_loads_no_more_than_it_needs():
-    program = (
-        "import runpy, sys; sys.argv = ['torchvts', '--version']\n"
-        "try: runpy.run_module('torchvts', run_name='__main__')\n"
-        "except SystemExit as stop: print(stop.code, *({'cv2', 'matplotlib', 'open3d', 'onnx'} & set(sys.modules)))"
-    )
-    done = subprocess.run([sys.executable, "-W", "ignore", "-c", program], capture_output=True, text=True, check=True)
-    assert done.stdout.split() == ["torchvts", vts.__version__, "0"]
 
 
 @pytest.mark.parametrize(

@@ -32,7 +32,9 @@ def own_address():
 def test_the_page_is_served_to_this_machine_alone(tmp_path):
     lights = vts.PointLights([[20, 0, 30], [-10, 17, 30], [-10, -17, 30]], [900, 900, 900])
     vts.Calibration.from_lights(lights, vts.Sensor("mine", 48, 64, 0.5)).save(tmp_path / "unit.safetensors")
-    command = [sys.executable, "-m", "torchvts", "view", "--web", str(tmp_path / "unit.safetensors")]
+    # shells let commands in the background ignore Ctrl-C, and so would what these start
+    program = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); from torchvts.cli import main; exit(main())"
+    command = [sys.executable, "-W", "ignore", "-c", program, "view", "--web", str(tmp_path / "unit.safetensors")]
     environment = os.environ | {"BROWSER": "true"}
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) as running:
         try:
@@ -48,9 +50,10 @@ def test_the_page_is_served_to_this_machine_alone(tmp_path):
             if outside not in (None, "127.0.0.1"):
                 with pytest.raises(OSError):
                     socket.create_connection((outside, port), timeout=5)
-        finally:
             running.send_signal(signal.SIGINT)
-        assert running.wait(30) == 130
+            assert running.wait(30) == 130
+        finally:
+            running.kill()
     assert [plan["name"] for plan in plans] == ["mine, calibrated", "digit, by its prior", "gelsight_mini, by its prior"]
     assert plans[0]["prior_deg"] is None and 4.0 < plans[2]["prior_deg"] < 5.0
 

@@ -4,7 +4,7 @@ import dataclasses
 
 import pytest
 import torch
-from test_frozen import MODES, lights_unit, marked_unit, response_unit
+from test_frozen import MODES, lights_unit, long, marked_unit, response_unit
 
 import torchvts as vts
 from torchvts.compiled import library
@@ -46,7 +46,7 @@ def worn(background):
 
 
 @pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("size", [(22, 32), (99, 131), (240, 320)], ids=str)
+@pytest.mark.parametrize("size", [(22, 32), (99, 131)], ids=str)
 def test_a_drawn_unit_on_another_day(mode, size):
     calibration, images = response_unit(size, 20.0 / size[1])
     image = worn(calibration.background)
@@ -73,7 +73,7 @@ def test_the_camera_has_a_gamma():
     assert differs(found, expected, images, 4e-6) > 2.0  # a power in single precision is good to 6e-8 of 2 mm
 
 
-@pytest.mark.parametrize("name", REAL)
+@pytest.mark.parametrize("name", ["gelsight_mini_b", "digit_a", *(long(name) for name in ("gelsight_mini_a", "digit_b"))])
 def test_the_prior_of_a_type_meets_a_real_unit(data, name):
     kind, presses = REAL[name]
     sensor = vts.Sensor.load(kind)

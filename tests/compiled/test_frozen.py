@@ -126,9 +126,14 @@ def marked_unit(size, pitch, side=3):
 UNITS = {"lights": lights_unit, "response": response_unit}
 
 
+def long(*values):
+    """A case of a grid that only make test-long runs."""
+    return pytest.param(*values, marks=pytest.mark.long)
+
+
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("kind", UNITS)
-@pytest.mark.parametrize("size", [(120, 160), (99, 131), (240, 320)], ids=str)
+@pytest.mark.parametrize("size", [(99, 131), (240, 320)], ids=str)
 def test_frozen_and_plain_agree(kind, mode, size):
     calibration, images = UNITS[kind](size, 20.0 / size[1])
     found, _ = agree(vts.DepthPipeline.from_calibration(calibration, mode), images)
@@ -138,19 +143,12 @@ def test_frozen_and_plain_agree(kind, mode, size):
 
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("kind", UNITS)
-@pytest.mark.parametrize("size", [(8, 8), (8, 40), (40, 8), (9, 11), (13, 17), (45, 63), (59, 79), (16, 640)], ids=str)
+@pytest.mark.parametrize(
+    "size", [(8, 8), (40, 8), (9, 11), (45, 63), *(long(s) for s in ((8, 40), (13, 17), (59, 79), (16, 640)))], ids=str
+)
 def test_odd_sizes(kind, mode, size):
     calibration, images = UNITS[kind](size, 12.0 / max(size))
     agree(vts.DepthPipeline.from_calibration(calibration, mode), images, 1e-4)  # slopes of so few pixels go up to 10
-
-
-@pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("kind", UNITS)
-def test_a_batch_of_none_is_empty_output(kind, mode):
-    calibration, images = UNITS[kind]((24, 32), 0.5)
-    pipe = vts.DepthPipeline.from_calibration(calibration, mode)
-    for one in (pipe, pipe.freeze()):
-        assert [tuple(part.shape) for part in one(images[:0])] == [(0, channels, 24, 32) for channels in (1, 2, 3, 1, 1)]
 
 
 @pytest.mark.parametrize("mode", MODES)
@@ -164,8 +162,7 @@ def test_what_a_sensor_may_have(mode, more):
     agree(vts.DepthPipeline.from_calibration(calibration, mode), images[:3])
 
 
-@pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("level", [0.45, 0.75])
+@pytest.mark.parametrize("mode, level", [("fast", 0.75), ("precise", 0.45), long("fast", 0.45), long("precise", 0.75)])
 def test_saturated_backgrounds_and_leds_that_have_dimmed(mode, level):
     lights = ring_lights(22.0, [15.0, 16.5, 18.0], rotation_deg=90.0, level=level)
     press, camera = scenes.sphere_press(8.0, 1.0, (0, 0), 120, 160, 0.25), {"noise_std": 0.004, "bits": 8}
@@ -211,7 +208,7 @@ def test_the_shadows_of_a_user_run_in_pytorch():
 
 
 @pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("side, size", [(3, (99, 131)), (5, (120, 160)), (18, (240, 321)), (26, (300, 401))], ids=str)
+@pytest.mark.parametrize("side, size", [(3, (99, 131)), (18, (240, 321)), long(5, (120, 160)), long(26, (300, 401))], ids=str)
 def test_printed_markers(mode, side, size):
     calibration, images = marked_unit(size, 20.0 / size[1], side)
     assert calibration.markers.diameter_px > 0.5 * side
@@ -236,11 +233,10 @@ def test_a_pinhole_camera_and_other_integrators(mode):
 
 def test_the_real_mini(data):
     """Presses of the first GelSight Mini, at its own size and half of it."""
-    for size in ((240, 320), (480, 640)):
+    for size, mode in (((240, 320), "precise"), ((480, 640), "fast")):
         unit = frames.mini(data, size)
-        for mode in MODES:
-            found, _ = agree(vts.DepthPipeline.from_calibration(unit.calibration, mode), unit.image)
-            assert float(found.depth_mm.max()) > 0.2
+        found, _ = agree(vts.DepthPipeline.from_calibration(unit.calibration, mode), unit.image)
+        assert float(found.depth_mm.max()) > 0.2
 
 
 @pytest.mark.parametrize("name, rest", [("gelslim_markers", "ref.jpg"), ("wyh_wedge_markers", "background.png")])
@@ -310,17 +306,18 @@ SETTINGS = {
 @pytest.mark.parametrize("name", SETTINGS)
 @pytest.mark.parametrize("kind", UNITS)
 def test_settings_changed_before_are_obeyed_or_refused(kind, name):
-    calibration, images = response_unit((96, 128), 0.2) if kind == "response" else lights_unit((96, 128), 0.25, blur_px=1.0)
+    calibration, images = response_unit((60, 80), 0.32) if kind == "response" else lights_unit((60, 80), 0.4, blur_px=1.0)
     pipe = vts.DepthPipeline.from_calibration(calibration, "precise")
     place, _, key = name.rpartition(".")
     block = dict(pipe.named_modules()).get(place.replace("normals", "solve.normals"))
     if block is None or not hasattr(block, key):
         pytest.skip("no such setting")
     setattr(block, key, SETTINGS[name])
-    if pipe.freeze().compiled:
-        agree(pipe, images[:3])
+    not_compiled = pipe.freeze().not_compiled
+    if not_compiled:
+        assert name.split(".")[0] in not_compiled
     else:
-        assert name.split(".")[0] in pipe.freeze().not_compiled
+        agree(pipe, images[:2])
 
 
 class Own(vts.ContactMask):
@@ -579,7 +576,7 @@ scene = vts.scenes.sphere_press(8.0, 1.0, (0, 0), 96, 128, 0.25)
 images = vts.scenes.render(scene, lights).detach().repeat(8, 1, 1, 1)
 start = time.perf_counter(); expected = frozen(images); whole = time.perf_counter() - start
 generator, interrupted = torch.Generator().manual_seed(0), 0
-for k in range(200):
+for k in range(60):
     delay = 1.2 * whole * float(torch.rand((), generator=generator))
     timer = threading.Timer(delay, os.kill, (os.getpid(), signal.SIGINT))
     try:
@@ -606,10 +603,10 @@ print("interrupted", interrupted)
 
 
 def test_ctrl_c_in_the_middle_of_a_batch():
-    """200 times: no thread is left, no memory is freed under one, the next batch is right."""
+    """60 times: no thread is left, no memory is freed under one, the next batch is right."""
     done = subprocess.run([sys.executable, "-W", "ignore", "-c", INTERRUPTED], capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr[-2000:]
-    assert int(done.stdout.split()[-1]) > 100
+    assert int(done.stdout.split()[-1]) > 30
 
 
 def _depth(frozen, images, found):

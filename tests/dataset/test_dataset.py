@@ -163,7 +163,8 @@ def test_other_settings_are_refused_and_overwrite_begins_anew(unit, tmp_path):
         (unit, {"mode": "precise"}, "mode 'fast' then, 'precise' now: give another --out, or --overwrite"),
         (unit, {"mode": "fast", "format": "npy"}, "format 'npz' then, 'npy' now"),
         (unit, {"mode": "fast", "pictures": True}, "pictures 'False' then, 'True' now"),
-        (other, {"mode": "fast"}, "calibration file '"),
+        (other, {"mode": "fast"}, f"on {time.strftime('%Y-%m-%d')} "),
+        (other, {"mode": "fast"}, ": another calibration than then, or its file was written anew: give another --out"),
     ):
         with pytest.raises(ValueError, match="was begun with other settings") as caught:
             reconstruct_dataset(calibration, source, out, **options)

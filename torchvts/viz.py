@@ -388,7 +388,7 @@ def calibration_figure(calibration: Calibration, presses: Sequence[Press]) -> Fi
         most = max(1.5 * least, float(error.flatten().quantile(0.9)))  # corners, where no ball fits, would take all colours
         extent = (-0.5, width - 0.5, height - 0.5, -0.5)
         drawn = axes[0, 1].imshow(error.numpy(), cmap="cividis", vmin=least, vmax=most, extent=extent)
-        axes[0, 1].set_title("error expected, degrees", fontsize=9)
+        axes[0, 1].set_title("error in a contact's middle, deg", fontsize=9)
         axes[0, 1].set(xlim=extent[:2], ylim=extent[2:])  # circles may reach beyond
         if calibration.metric and (least_known := press_next(calibration)) is not None:
             axes[0, 1].plot(*least_known[0], "+", color="white", markersize=9, path_effects=_HALO)
@@ -419,8 +419,7 @@ def calibration_figure(calibration: Calibration, presses: Sequence[Press]) -> Fi
 
 def _facts(calibration: Calibration) -> str:
     report = calibration.report
-    own = "on its own presses" if "presses" in report else "on the units of its prior"
-    words = {"own_deg": own, "held_out_deg": "on each press by the others", "stated_deg": "expected anywhere"}
+    words = {"held_out_deg": "on each press by the others", "stated_deg": "expected anywhere"}
     errors = [(text, report.get(key)) for key, text in words.items()]
     figures = [f"{text}: {value:.2f} degrees" for text, value in errors if isinstance(value, float)]
     return "\n".join(

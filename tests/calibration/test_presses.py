@@ -199,7 +199,7 @@ def test_presses_give_a_response(unit):
     name, _, _, _, calibration, _ = unit
     report = calibration.report
     assert report["model"] == "response" and calibration.response is not None and calibration.lights is None
-    assert report["reason"].startswith("from 12 presses: ")
+    assert report["reason"] == "from 12 presses"
     assert report["tried"] == [{"name": "presses", "error_deg": report["held_out_deg"], "doubts": report["doubts"]}]
     assert len(report["doubts"]) == 1 and report["doubts"][0].startswith("not checked: ") and report["not_metric"] == []
     assert report["own_deg"] < report["held_out_deg"] < 1.0 and report["own_deg"] < report["stated_deg"], name

@@ -283,6 +283,14 @@ def test_one_format_that_fails_leaves_the_others(low, tmp_path, monkeypatch):
     assert not rows[0].ok and rows[0].reason and not (tmp_path / "pipeline.pt").exists()
 
 
+def test_a_plan_is_written_and_compared(low, tmp_path):
+    calibration, frames = low
+    (row,) = export.export_checked(pipeline(calibration, "precise"), tmp_path, ["plan"], frames)
+    assert row.ok and row.path.name == "pipeline.plan" and row.difference_mm <= 1e-5, row
+    (row,) = export.export_checked(pipeline(calibration, "fast", normals=learned()), tmp_path / "own", ["plan"], frames)
+    assert row.reason.startswith("pipe: expected one that is compiled")
+
+
 def test_the_script(run_script, low, tmp_path):
     low[0].save(tmp_path / "unit.safetensors")
     vts.write_image(tmp_path / "press.png", low[1][0])

@@ -2,10 +2,16 @@
 
 import shutil
 
+import numpy as np
 import pytest
+import torch
 from documents import ROOT, run
 
+import torchvts as vts
+from torchvts import scenes
+from torchvts.dataset import reconstruct_dataset
 from torchvts.samples import fetch_sample
+from torchvts.stream import VideoFile
 
 
 @pytest.fixture
@@ -40,6 +46,26 @@ def test_own_sensor(empty_folder):
     names = run(ROOT / "docs" / "own_sensor.md")
     assert float(names["out"].depth_mm.max()) == pytest.approx(0.4, abs=0.02)
     assert names["sensor"].field_mm == pytest.approx((12.0, 16.0))
+
+
+def test_the_page_on_data_sets(empty_folder, ring):
+    scene = scenes.sphere_press(3.0, 0.5, (0.0, 0.0), 60, 80, 0.2)
+    lights = ring(radius_mm=16.0, height_mm=20.0)
+    press, rest = (scenes.render(one, lights, noise_std=0.003, bits=8)[0] for one in (scene, scenes.undeformed(scene)))
+    vts.Calibration.from_lights(lights, vts.Sensor("rig", 60, 80, 0.2), rest).save("unit.safetensors")
+    (empty_folder / "out" / "frames").mkdir(parents=True)
+    vts.write_image("out/frames/0.png", press)
+    pixels = (255.0 * rest).round().byte().permute(1, 2, 0).numpy()[..., ::-1]
+    with VideoFile("film.avi", 30.0) as film:
+        for _ in range(15):
+            film.write(np.ascontiguousarray(pixels))
+    reconstruct_dataset("unit.safetensors", "out/frames/0.png", "out/press")
+    (empty_folder / "out" / "press" / "0.npz").rename("out/press/press.npz")
+    reconstruct_dataset("unit.safetensors", "film.avi", "out/film", format="video-npz")
+    names = run(ROOT / "docs" / "datasets.md")
+    assert len(names["deepest_mm"]) == 15 and float(names["result"].depth_mm.max()) == pytest.approx(0.5, rel=0.1)
+    assert torch.allclose(next(iter(names["pairs"]))[1], names["result"].depth_mm[0], atol=1e-6)
+    assert sum(len(image) for image, _ in names["loader"]) == 16
 
 
 def test_the_page_on_motion_runs_and_finds_the_drag():

@@ -12,7 +12,7 @@ from ..model.sensor import Sensor
 from .contacts import Contact, press_row, read_contacts, used
 from .posterior import weights_of
 from .presses import Press
-from .response_fit import FEW, fit_response
+from .response_fit import fit_response
 
 RESPONSE_BLUR_PX = 1.0
 """Blur of a response field at 320 x 240, pixels."""
@@ -41,11 +41,10 @@ def by_presses(
     weight, given = float(weights_of(used(contacts)).sum()), f"{count} press{'es' * (count > 1)}"
     if f"{weight:.1f}" != f"{count:.1f}":
         given += f" that count as {weight:.1f}"
-    error = f"{fit.held_out_deg:.2f} degrees on each by the others" if count >= FEW else f"{fit.stated_deg:.1f} degrees expected"
     report: Report = {
         "model": "response",
         "source": "presses",
-        "reason": f"from {'the sensor' + chr(39) + 's prior and ' if prior else ''}{given}: {error}",
+        "reason": f"from {'the sensor' + chr(39) + 's prior and ' if prior else ''}{given}",
         "held_out_deg": fit.held_out_deg,
         "own_deg": fit.own_deg,
         "stated_deg": fit.stated_deg,

@@ -28,8 +28,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_out(parser, "for the files")
     add_mode(parser, "fast")
     add_network(parser)
-    names = f"of {', '.join(export.FORMATS)}; a plan for C is pipe.freeze().save(FILE)"
-    parser.add_argument("--format", nargs="+", default=list(export.FORMATS), metavar="NAME", help=names)
+    usual = [name for name in export.FORMATS if name != "plan"]
+    names = f"{', '.join(usual)} (all three), or plan: for C and web pages"
+    parser.add_argument("--format", nargs="+", default=usual, metavar="NAME", help=names)
     parser.add_argument("--frames", type=Path, metavar="INPUT", help="image, folder or video to compare on too; 8 frames at most")
 
 

@@ -220,10 +220,14 @@ def summary(tracking: _Tracking, stream: TactileStream) -> dict[str, Any]:
     }
 
 
-def _median_std(rows: list[dict[str, object]]) -> dict[str, float]:
-    """Median standard deviation of each shift, mm, and of each turn, degrees, over rows of poses.csv."""
-    names = [name for name in QUALITY if name.startswith("std_")]
-    return {name.removeprefix("std_"): statistics.median(float(str(row[name])) for row in rows) for name in names} if rows else {}
+def _median_std(rows: list[dict[str, object]]) -> dict[str, float | None]:
+    """Median standard deviation of each shift, mm, and of each turn, degrees, over the rows of poses.csv in which it is known."""
+    found: dict[str, float | None] = {}
+    for name in (name.removeprefix("std_") for name in QUALITY if name.startswith("std_")):
+        motion = f"rotation about {name[1]}" if name.startswith("r") else f"translation along {name[0]}"
+        known = [float(str(row[f"std_{name}"])) for row in rows if motion not in str(row["ambiguous"]).split("; ")]
+        found[name] = statistics.median(known) if known else None
+    return found
 
 
 def _several(number: int, name: str) -> str:
@@ -245,7 +249,8 @@ def _print_summary(found: dict[str, Any]) -> None:
     if uncertain:
         print(f"  {_several(uncertain, 'frame')} known less well than to {TRUSTED_DEG:g} degree and {TRUSTED_MM:g} mm")
         std = found["median_std"]
-        shifts, turns = (", ".join(f"{axis} {std[key.format(axis)]:.2g}" for axis in "xyz") for key in ("{}_mm", "r{}_deg"))
+        said = {name: "unknown" if value is None else f"{value:.2g}" for name, value in std.items()}
+        shifts, turns = (", ".join(f"{axis} {said[key.format(axis)]}" for axis in "xyz") for key in ("{}_mm", "r{}_deg"))
         print(f"  standard deviations, medians: {shifts} mm; turns about {turns} degrees")
     if found["keyframes"] > 1:
         deg, mm = found["largest_drift_deg"], found["largest_drift_mm"]

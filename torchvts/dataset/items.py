@@ -44,9 +44,8 @@ class Item(NamedTuple):
     is_film: bool
 
     def frame_name(self, number: int) -> str:
-        """Name of a frame in tables and messages; ``number`` is negative for an image."""
-        name = one_line(self.path)
-        return name if number < 0 else f"{name}/{number:06d}"
+        """Name of a frame in tables and messages: the path of an image, whose ``number`` is negative, else :meth:`frame_stem`."""
+        return one_line(self.path if number < 0 else self.frame_stem(number))
 
     def frame_stem(self, number: int) -> str:
         """Stem of the results of a frame; ``number`` is negative for an image."""

@@ -4,6 +4,7 @@ import json
 import os
 import re
 import shutil
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields, replace
@@ -95,16 +96,19 @@ def join(out: Path, settings: Settings) -> Settings:
             f"out: {out} holds the results of {brief(begun.source)}, not of {brief(settings.source)}: give each input another "
             "--out, or name all inputs in one command, with --overwrite to begin anew"
         )
-    names = {"calibration_sha256": "calibration file"}
+    files = {"calibration_sha256": "calibration", "network_sha256": "network"}
     other = [
-        f"{names.get(field.name, field.name)} {str(getattr(begun, field.name))[:60]!r} then, "
-        f"{str(getattr(settings, field.name))[:60]!r} now"
+        f"another {files[field.name]} than then, or its file was written anew"
+        if field.name in files
+        else f"{field.name} {str(getattr(begun, field.name))[:60]!r} then, {str(getattr(settings, field.name))[:60]!r} now"
         for field in fields(Settings)
         if getattr(begun, field.name) != getattr(settings, field.name)
     ]
     if other:
+        when = time.strftime("%Y-%m-%d %H:%M", time.localtime(path.stat().st_mtime))
         raise ValueError(
-            f"out: {out} was begun with other settings: {'; '.join(other)}: give another --out, or --overwrite to begin anew"
+            f"out: {out} was begun with other settings on {when}: {'; '.join(other)}: give another --out, or --overwrite to begin "
+            "anew"
         )
     return begun
 

@@ -178,12 +178,17 @@ class Format:
     tolerance_mm: float
 
 
+def _write_plan(pipe: DepthPipeline, path: Path) -> None:
+    pipe.freeze().save(path)
+
+
 FORMATS = {
     "torchscript": Format("pipeline.pt", export_torchscript, 1e-5),
     "pt2": Format("pipeline.pt2", export_program, 1e-5),
     "onnx": Format("pipeline.onnx", export_onnx, 1e-3),
+    "plan": Format("pipeline.plan", _write_plan, 1e-5),
 }
-"""The formats by name."""
+"""The formats by name; the plan is that of :meth:`torchvts.FrozenPipeline.save`, without networks."""
 
 
 def missing(name: str) -> str:

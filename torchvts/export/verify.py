@@ -18,7 +18,7 @@ from ..core.checks import check_batch, check_choice, check_integer, check_path, 
 from ..core.files import make_folder
 from ..core.geometry import pixel_grid_mm
 from ..model.calibration import Calibration, check_calibration
-from ..pipeline import DepthPipeline
+from ..pipeline import DepthPipeline, FrozenPipeline
 from . import bare_process
 from .formats import FORMATS, check_pipeline
 
@@ -117,7 +117,8 @@ def _export_one(pipe: DepthPipeline, folder: Path, name: str, images: Tensor) ->
 def compare(path: str | Path, pipe: DepthPipeline, images: Tensor, name: str) -> float:
     """Largest difference of depth, mm, between an exported file and the pipeline, over batches of 1, 2, 3 and all images.
 
-    The file is run by a process in which torchvts cannot be imported, the pipeline in this one.
+    The file is run by a process in which torchvts cannot be imported, the pipeline in this one; a plan by this one's compiled
+    library.
 
     Args:
         path: the file.
@@ -131,7 +132,12 @@ def compare(path: str | Path, pipe: DepthPipeline, images: Tensor, name: str) ->
     check_pipeline(pipe)
     check_batch("images", images, 3)
     batches = sorted({size for size in (1, 2, 3, images.shape[0]) if size <= images.shape[0]})
-    found, used = run_bare(path, images, name, batches), copy.deepcopy(pipe).eval()
+    if name == "plan":
+        plan = FrozenPipeline.load(path)
+        found = [plan(images[:size]).depth_mm for size in batches]
+    else:
+        found = run_bare(path, images, name, batches)
+    used = copy.deepcopy(pipe).eval()
     with torch.no_grad():
         expected = [used(images[:size]).depth_mm for size in batches]
     differences = [float((one.double() - two.double()).abs().max()) for one, two in zip(found, expected, strict=True)]

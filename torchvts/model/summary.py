@@ -60,15 +60,14 @@ def summary_of(calibration: Calibration, tried: bool = False) -> str:
 
 
 def where_next(calibration: Calibration) -> str:
-    """Where a press would say most, and how well normals are known there; "" where :func:`press_next` says nothing."""
+    """Where a press would say most; "" where :func:`press_next` says nothing."""
     found = press_next(calibration)
     if found is None:
         return ""
-    place, error_deg = found
+    place, _ = found
     sensor = calibration.sensor
     x, y = ((n - 0.5 * (size - 1)) * sensor.mm_per_pixel for n, size in zip(place, (sensor.width, sensor.height), strict=True))
-    where = f"x {place[0]}, y {place[1]} px of rectified images ({x:+.1f}, {y:+.1f} mm from the middle)"
-    return f"around {where}: the middle of a contact is known least there, to about {error_deg:.1f} degrees"
+    return f"around x {place[0]}, y {place[1]} px of rectified images ({x:+.1f}, {y:+.1f} mm from the middle), which is known least"
 
 
 def doubts_of(report: Report) -> list[str]:

@@ -253,12 +253,6 @@ TABLE = {
         "groups": [torch.zeros(8), torch.zeros(9, dtype=torch.int64), None], "hidden": [(), (0,), ("4",)],
         "max_epochs": INTEGER, "patience": INTEGER, "batch_size": INTEGER, "held_out": [0.0, 1.0, NAN, "some"],
         "weight_decay": [-1.0, NAN, "some"]}),
-    "fit_prior": Entry({"background": image(), "sensor": sensor(), "presses": [PRESS], "source": ""},
-        {"background": images(), "presses": [PRESS, [], [image()], None, "presses"], "source": [None, 3],
-        "others": [None, 3, "unit", [image()]]}, run=False),
-    "score_prior": Entry(
-        {"background": image(), "sensor": vts.Sensor.load("gelsight_mini", height=HEIGHT, width=WIDTH), "presses": [PRESS]},
-        {"background": images(), "presses": [PRESS, [image()], None, "presses"]}, run=False),
     "gradient_from_normal": Entry(
         {"normal": torch.ones(1, 3, 8, 8), "max_slope": 10.0}, {"normal": batches(3), "max_slope": NUMBER}),
     "near_field_shading": Entry(

@@ -90,7 +90,7 @@ TABLE = {
         {"mode": ["slow", None, 1], "normals": ["lookup", 3], "integrate": ["dct", 3], "contact": ["4.5", 4.5, torch.ones(3)]}),
     "DepthPipeline.from_gs_sdk": Entry({"weights": ..., "background": image(), "sensor": sensor()}, {
         "weights": [Path("no/such/nnmodel.pth"), "."], "background": images(), "sensor": ["no_such_sensor", "no/such.yaml"]},
-        file=("weights", "sensor"), run=False),
+        label=("mode", "markers"), file=("weights", "sensor"), run=False),
     "DepthPipeline.forward": Entry({"images": image()[None]}, {"images": IMAGES}, lambda: pipe()),
     "FrozenPipeline": Entry({"pipe": pipe()}, {"pipe": [None, "pipe.pt", torch.nn.Identity()]}),
     "FrozenPipeline.load": Entry({"path": ...}, {"path": [*MISSING, ".", 3, None]}, file=("path",), run=False),

@@ -22,7 +22,7 @@ from pathlib import Path
 import torchvts as vts
 from lab import sets
 from lab.commands import main_of, parser_of
-from torchvts.calibration import PriorUnit, fit_prior, score_prior
+from lab.prior import PriorUnit, fit_prior, score_prior
 from torchvts.model.response_field import SensorPrior
 from torchvts.stream import read_background, read_press_images
 

@@ -16,9 +16,9 @@ import torchvts as vts
 from lab import methods, metrics, pose_accuracy
 from lab.commands import main_of, parser_of
 from lab.sets import data_folder
+from lab.training import Training
 from torchvts import viz
 from torchvts.pose import contact_cloud
-from torchvts.training.presses import Training
 
 PITCH = 0.0625
 TACTO = {  # largest error of the paper in px; centre and radius that it found, and the true ones, mm

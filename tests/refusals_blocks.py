@@ -90,7 +90,7 @@ TABLE = {
         {"mode": ["slow", None, 1], "normals": ["lookup", 3], "integrate": ["dct", 3], "contact": ["4.5", 4.5, torch.ones(3)]}),
     "DepthPipeline.from_gs_sdk": Entry({"weights": ..., "background": image(), "sensor": sensor()}, {
         "weights": [Path("no/such/nnmodel.pth"), "."], "background": images(), "sensor": ["no_such_sensor", "no/such.yaml"]},
-        file=("weights", "sensor"), run=False),
+        label=("mode", "markers"), file=("weights", "sensor"), run=False),
     "DepthPipeline.forward": Entry({"images": image()[None]}, {"images": IMAGES}, lambda: pipe()),
     "FrozenPipeline": Entry({"pipe": pipe()}, {"pipe": [None, "pipe.pt", torch.nn.Identity()]}),
     "FrozenPipeline.load": Entry({"path": ...}, {"path": [*MISSING, ".", 3, None]}, file=("path",), run=False),
@@ -135,8 +135,6 @@ TABLE = {
         np.zeros((50, 3))],
         "slope": [torch.zeros(49, 2), torch.full((50, 2), INF), torch.zeros(50, 2, dtype=torch.int64), None],
         "bins": [2, 500, 4.5, "4"], "smoothing": [-1.0, NAN, 99.0, "1"]}),
-    "NormalFromLookup.load": Entry({"path": ...}, {"path": [*MISSING, "."]}, file=("path",), run=False),
-    "NormalFromLookup.save": Entry({"path": ...}, {"path": [*MISSING, "."]}, lambda: lookup().save, file=("path",), run=False),
     "NormalFromLookup.forward": forward(lookup, 3, "compensated", label=("depth_mm",)),
     "NormalFromMLP": Entry({"height": HEIGHT, "width": WIDTH, "flat": FLAT, "hidden": (4,), "output": "angle",
         "input_domain": "image", "blur_px": 0.0}, {"flat": images(), "hidden": [(), (0,), ("4",)], "output": ["slope", None],
@@ -255,12 +253,6 @@ TABLE = {
         "groups": [torch.zeros(8), torch.zeros(9, dtype=torch.int64), None], "hidden": [(), (0,), ("4",)],
         "max_epochs": INTEGER, "patience": INTEGER, "batch_size": INTEGER, "held_out": [0.0, 1.0, NAN, "some"],
         "weight_decay": [-1.0, NAN, "some"]}),
-    "fit_prior": Entry({"background": image(), "sensor": sensor(), "presses": [PRESS], "source": ""},
-        {"background": images(), "presses": [PRESS, [], [image()], None, "presses"], "source": [None, 3],
-        "others": [None, 3, "unit", [image()]]}, run=False),
-    "score_prior": Entry(
-        {"background": image(), "sensor": vts.Sensor.load("gelsight_mini", height=HEIGHT, width=WIDTH), "presses": [PRESS]},
-        {"background": images(), "presses": [PRESS, [image()], None, "presses"]}, run=False),
     "gradient_from_normal": Entry(
         {"normal": torch.ones(1, 3, 8, 8), "max_slope": 10.0}, {"normal": batches(3), "max_slope": NUMBER}),
     "near_field_shading": Entry(

@@ -41,7 +41,7 @@ RECORDS = {
 }  # fmt: skip
 """Results that users get and do not make: their constructors keep what they are given. (Their methods are in the table.)"""
 PARTS = {
-    "PoseTracker", "PriorUnit", "TrackedPose",
+    "PoseTracker", "TrackedPose",
     "DepthBrightness", "Integrator", "NormalModel", "Refine", "ResponseField", "ResponseModel",
     "SensorPrior", "Shadows", "SlopesOfDepth", "SlopesOfPixels", "Solve", "WrappedIntegrator", "WrappedNormals", "as_integrator",
     "as_normal_model", "by_presses", "channel_structure", "check_calibration", "check_domain", "check_sensor",

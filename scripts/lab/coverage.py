@@ -15,7 +15,6 @@ from torchvts.pipeline import ConfidentOutput, ConfidentPipeline, bound_at
 from torchvts.pipeline.confidence import DEPTH_SPREAD
 from torchvts.scenes import objects as solids
 from torchvts.training.balls import Truth
-from torchvts.training.presses import Training
 
 from . import rows as records
 from .drawn_sensors import DrawnPress, drawn_sensor
@@ -23,6 +22,7 @@ from .metrics import normal_angle_deg
 from .random_scenes import random_frame
 from .rows import Column, Row, error_column
 from .sets import Target, load, truth_of
+from .training import Training
 
 LEVELS = (0.5, 0.68, 0.8, 0.9, 0.95)
 """Probabilities at which coverage is measured."""

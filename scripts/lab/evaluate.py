@@ -17,13 +17,13 @@ from tqdm import tqdm
 
 from torchvts.core.tables import number
 from torchvts.pipeline import DepthOutput
-from torchvts.training.presses import Training
 
 from . import rows as records
 from .methods import METHODS, Built, Method
 from .rows import Column, Row, error_column, mean, median
 from .score import PressScore, score_press, score_surface
 from .sets import DRAWN, DataSet, Fold, Target, load
+from .training import Training
 
 COMPARED = tuple(name for name, method in METHODS.items() if method.from_presses is not None)
 """Names of the methods that sets can score."""

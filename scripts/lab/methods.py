@@ -21,9 +21,10 @@ from torchvts.normals import NormalFromIntensity, NormalFromLookup, NormalFromML
 from torchvts.pipeline import DepthOutput, DepthPipeline, Shadows
 from torchvts.scenes import render, sphere_press
 from torchvts.skin import ContactFromDepth
-from torchvts.training.presses import Training, quiet_calibrate, train_network, training_pixels
+from torchvts.training.presses import quiet_calibrate, train_network, training_pixels
 
 from .peers import GsSdkPipeline, as_output
+from .training import Training
 
 GIVEN_NETWORK = "given network"
 """Name of a network that was trained before."""

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchvts.calibration import RESPONSE_BLUR_PX, Press, fit_prior, read_presses
+from torchvts.calibration import RESPONSE_BLUR_PX, Press, read_presses
 from torchvts.cli.options import cut_frames
 from torchvts.compensate import Compensate
 from torchvts.core.checks import check_image, check_integer
@@ -31,12 +31,13 @@ from torchvts.scenes import Scene
 from torchvts.skin import ZeroBackground
 from torchvts.stream.sources import open_source
 from torchvts.training.balls import Truth, ball_truth, label
-from torchvts.training.presses import with_centers
 
 from .drawn_sensors import SEEDS, drawn_sensor
 from .methods import Method, shipped_prior, with_network
+from .prior import fit_prior
 from .rims import visible_rim
 from .score import undeformed_truth
+from .training import with_centers
 
 CHANGED = 15.0 / 255.0
 """A pixel of gelsight_mini_b is scored where a channel has changed by more than this."""

@@ -13,7 +13,6 @@ from torchvts.model import Sensor
 from torchvts.normals import NormalFromMLP
 from torchvts.pipeline import MODES, DepthOutput
 from torchvts.scenes import Scene
-from torchvts.training.presses import Training
 
 from . import rows as records
 from .methods import METHODS, Built, Reconstruct, lookup_table, point_lights, shipped_prior
@@ -22,6 +21,7 @@ from .peers import GsSdkPipeline, peer_frame
 from .rows import Column, Row, Size, Time, error_column, mean
 from .score import score_press
 from .timing import SIZES, in_turn, machine, rig
+from .training import Training
 
 GS_SDK = "gs_sdk's pipeline"
 

@@ -11,9 +11,10 @@ import pytest
 import torch
 
 import torchvts as vts
+from lab.prior import fit_log_background
 from torchvts.calibration.doubts import of_type
 from torchvts.calibration.given_images import colour_share, colour_variation
-from torchvts.model.response_field import CHANGE_SCALE, ResponseField, ResponseModel, SensorPrior, fit_log_background
+from torchvts.model.response_field import CHANGE_SCALE, ResponseField, ResponseModel, SensorPrior
 from torchvts.model.summary import expected
 
 HEIGHT, WIDTH, PITCH = 90, 120, 0.15

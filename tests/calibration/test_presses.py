@@ -18,13 +18,13 @@ from conftest import ring_lights
 
 import torchvts as vts
 from lab import metrics
-from torchvts.calibration import PriorUnit, fit_prior, score_prior
+from lab.prior import PriorUnit, fit_log_background, fit_prior, score_prior
 from torchvts.calibration.balls import guess_circle
 from torchvts.calibration.contacts import read_contacts
 from torchvts.calibration.posterior import Evidence, largest, prior_of
 from torchvts.calibration.press_model import with_preprocessing
 from torchvts.calibration.response_fit import fit_depth_brightness
-from torchvts.model.response_field import CHANGE_SCALE, DepthBrightness, ResponseField, fit_log_background, sine_from_slope
+from torchvts.model.response_field import CHANGE_SCALE, DepthBrightness, ResponseField, sine_from_slope
 
 HEIGHT, WIDTH, PITCH = 120, 160, 0.125
 SIZE = (HEIGHT, WIDTH, PITCH)

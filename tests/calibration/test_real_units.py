@@ -8,8 +8,8 @@ import torch
 
 import torchvts as vts
 from lab import metrics
+from lab.prior import fit_prior
 from lab.score import score_press
-from torchvts.calibration import fit_prior
 from torchvts.calibration.doubts import of_type
 from torchvts.core.blur import blur, gaussian_weights
 

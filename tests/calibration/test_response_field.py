@@ -13,6 +13,7 @@ import yaml
 from conftest import refused_when_rewritten, rewritten
 
 import torchvts as vts
+from lab.prior import fit_log_background
 from torchvts.calibration.response_fit import STEEPER
 from torchvts.core.blur import gaussian_weights
 from torchvts.core.geometry import gradient_from_normal, gradient_of_depth
@@ -22,7 +23,6 @@ from torchvts.model.response_field import (
     ResponseField,
     ResponseModel,
     SensorPrior,
-    fit_log_background,
     sine_from_slope,
     slope_from_sine,
 )

@@ -15,12 +15,12 @@ import torchvts as vts
 from lab import sets
 from lab.drawn_sensors import drawn_sensor
 from lab.gallery import CORRUPTIONS, undisturbed
+from lab.training import Training
 from torchvts import scenes
 from torchvts.core.blur import blur, gaussian_weights
 from torchvts.diagnose import Diagnosis, Finding
 from torchvts.diagnose.checks import CHECKS
 from torchvts.model.response_field import ResponseModel
-from torchvts.training.presses import Training
 
 SIZE = {"height": 120, "width": 160, "mm_per_pixel": 0.25}
 

@@ -14,11 +14,12 @@ import torchvts as vts
 from lab import evaluate as ev
 from lab import methods, sets
 from lab.score import score_press
+from lab.training import Training
 from torchvts.core.geometry import normal_from_gradient
 from torchvts.model.gs_sdk import CATALOG_COLUMNS, LABEL_COLUMNS
 from torchvts.training import presses as presses_room
 from torchvts.training.balls import ball_truth
-from torchvts.training.presses import Training, train_network, training_pixels
+from torchvts.training.presses import train_network, training_pixels
 
 HEIGHT, WIDTH, PITCH = 96, 128, 0.15
 CENTERS = ((-3.0, -2.0), (3.5, -2.5), (0.0, 0.5), (-4.0, 2.5), (3.0, 2.5), (0.5, -3.0))
@@ -238,7 +239,8 @@ def test_without_labels_balls_are_found(folder, monkeypatch, tmp_path):
     training = Training(*vts.read_presses(bare), sensor)
     for found, given in zip(training.located, presses, strict=True):
         assert math.dist(found.center_px, given.center_px) < 1.5
-    monkeypatch.setattr(Training, "found", training.found)  # the same presses again
+    for room in ("torchvts.training.presses", "lab.training"):  # the same presses again
+        monkeypatch.setattr(f"{room}.quiet_calibrate", lambda *arguments: training.calibration)
     result = ev.evaluate(sets.from_folder(bare, sensor, folds=1), ["flat"])
     assert "centers from calibrate on the scored presses (6)" in result.data.how and result.rows[0].frames == 6
     fit = train_network(*vts.read_presses(bare), sensor, max_epochs=2)

@@ -7,7 +7,6 @@ from .lights import POORLY_CONSTRAINED_DEG, LightFit, fit_lights
 from .outliers import LEAST_WEIGHT
 from .press_model import RESPONSE_BLUR_PX, by_presses, with_preprocessing
 from .presses import Press, read_presses
-from .prior import PriorUnit, fit_prior, score_prior
 from .unit import calibrate
 
 __all__ = [
@@ -19,13 +18,10 @@ __all__ = [
     "CalibrationWarning",
     "LightFit",
     "Press",
-    "PriorUnit",
     "by_presses",
     "calibrate",
     "channel_structure",
     "fit_lights",
-    "fit_prior",
     "read_presses",
-    "score_prior",
     "with_preprocessing",
 ]

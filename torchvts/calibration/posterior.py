@@ -142,9 +142,3 @@ class Evidence:
 def weights_of(contacts: Sequence[Contact]) -> Tensor:
     """(N,): how much of a press each counts."""
     return torch.tensor([contact.weight for contact in contacts], dtype=torch.float64)
-
-
-def mean_error_deg(field: ResponseField, contacts: Sequence[Contact]) -> float:
-    """Mean angle between the normals of a field and those of balls, degrees."""
-    errors = [ContactForms(Family.of(field), contact).error_deg(field.tensor()) for contact in contacts]
-    return sum(errors) / len(errors)

@@ -331,20 +331,6 @@ def _angles(value: object) -> tuple[float, ...]:
     return tuple(check_positive("held_out_deg", angle, 90.0) for angle in value)
 
 
-def fit_log_background(background: Tensor, mm_per_pixel: float) -> tuple[tuple[float, ...], ...]:
-    """``log_background`` of a :class:`SensorPrior`, by least squares.
-
-    Args:
-        background: (3, H, W), linear light.
-        mm_per_pixel: pixel pitch, mm.
-    """
-    height, width = background.shape[1:]
-    basis = image_basis(height, width, mm_per_pixel, 0.5 * width * mm_per_pixel, 4).flatten(1)
-    values = background.double().clamp_min(1e-3).log().flatten(1)
-    solution = torch.linalg.lstsq(basis.t(), values.t()).solution  # (15, 3)
-    return tuple(tuple(float(v) for v in column) for column in solution.t())
-
-
 def term_degrees_by_term(degree: int, product_degree: int, cubic_degree: int = -1) -> dict[tuple[int, ...], int]:
     """Degree in position of every term, in order: the three changes, then their products of two, and of three."""
     orders = enumerate((degree, product_degree, cubic_degree), start=1)

@@ -10,6 +10,7 @@ from ..compensate import Compensate, unchanged_light
 from ..core.checks import (
     check_batch,
     check_choice,
+    check_image,
     check_pitch,
     check_positive,
     check_range,
@@ -19,10 +20,9 @@ from ..core.frame import Conditions, DepthOutput, Frame, Solution
 from ..core.geometry import GradientFromNormal, normal_from_gradient
 from ..core.settings import check_settings, settings_as_tensor
 from ..integration import PoissonDCT, WrappedIntegrator, as_integrator
-from ..model import Calibration, Sensor, check_calibration
-from ..normals import NormalFromIntensity, NormalFromResponse, WrappedNormals, as_normal_model, check_domain
+from ..model import Calibration, FillMarkers, Sensor, check_calibration
+from ..normals import NormalFromIntensity, NormalFromMLP, NormalFromResponse, WrappedNormals, as_normal_model, check_domain
 from ..skin import ContactFromDepth, ContactMask, ContactSettings, ZeroBackground, moved, unseen_deg
-from .gs_sdk import gs_sdk_blocks
 from .refine import Refine, SlopesOfDepth, SlopesOfPixels
 from .solve import Solve
 
@@ -164,21 +164,36 @@ class DepthPipeline(nn.Module):
             return eval_around(pipe, *given)
 
     @classmethod
-    def from_gs_sdk(cls, weights: str | Path, background: Tensor, sensor: Sensor | str) -> "DepthPipeline":
-        """The pipeline of a network that gs_sdk trained, on the images that it was trained on; mode fast, for it takes no depth.
+    def from_gs_sdk(
+        cls,
+        weights: str | Path,
+        background: Tensor,
+        sensor: Sensor | str,
+        mode: str = "fast",
+        markers: FillMarkers | None = None,
+    ) -> "DepthPipeline":
+        """The pipeline of a network that gs_sdk trained, on the images that it was trained on.
 
         Args:
             weights: gs_sdk's ``nnmodel.pth``, of which nothing but tensors is unpickled; or what ``torchvts train`` wrote.
             background: (3, H, W), image of the unit without contact in [0, 1], R, G, B; the network's gradients there are zero.
             sensor: the sensor, or what :meth:`Sensor.load` takes.
+            mode: "fast", for a network takes no depth.
+            markers: what filled the markers of the background, and fills those of frames; None for a skin without.
         Raises:
             FileNotFoundError: no such weights or sensor.
-            ValueError, TypeError: no weights of such a network, or a background of another size, type or range.
+            ValueError, TypeError: no weights of such a network, another mode, or a background of another size, type or range.
         Example:
             >>> pipe = DepthPipeline.from_gs_sdk("nnmodel.pth", background, "gelsight_mini")  # doctest: +SKIP
         """
         sensor = sensor if isinstance(sensor, Sensor) else Sensor.load(sensor)
-        return cls(*gs_sdk_blocks(weights, background, sensor), mm_per_pixel=sensor.mm_per_pixel).eval()
+        check_image("background", background, sensor.height, sensor.width, sensor.name)
+        network = NormalFromMLP.load(weights, background)
+        compensate = Compensate(blur_px=network.blur_px, markers=markers)
+        flat = compensate(background[None])[0].clamp(0.0, 1.0)
+        network.set_flat(flat)
+        modules = (compensate, ContactMask(flat), network, GradientFromNormal(), PoissonDCT(sensor.mm_per_pixel))
+        return cls(*modules, mm_per_pixel=sensor.mm_per_pixel, mode=mode).eval()
 
     if TYPE_CHECKING:
 

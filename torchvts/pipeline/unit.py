@@ -5,7 +5,6 @@ from pathlib import Path
 from ..model import Calibration, check_calibration
 from ..skin import ContactSettings
 from .depth import DepthPipeline
-from .gs_sdk import gs_sdk_blocks
 
 
 def unit_pipeline(
@@ -32,6 +31,4 @@ def unit_pipeline(
         return DepthPipeline.from_calibration(calibration, mode, contact=contact)
     if contact is not None:
         raise ValueError("contact: expected None beside a network, whose images have other thresholds")
-    sensor = calibration.sensor
-    blocks = gs_sdk_blocks(network, calibration.background_value, sensor, calibration.markers)
-    return DepthPipeline(*blocks, mm_per_pixel=sensor.mm_per_pixel, mode=mode).eval()
+    return DepthPipeline.from_gs_sdk(network, calibration.background_value, calibration.sensor, mode, calibration.markers)

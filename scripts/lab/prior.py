@@ -8,18 +8,17 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ..core.checks import check_image, check_record, check_sequence
-from ..model.calibration import Calibration
-from ..model.response_field import ResponseField, ResponseModel, SensorPrior, fit_log_background
-from ..model.sensor import Sensor, check_sensor
-from .contacts import Contact, used
-from .doubts import CalibrationWarning
-from .field import Family, power_of
-from .given_images import sort_presses
-from .posterior import Evidence, Prior, mean_error_deg
-from .press_model import by_presses
-from .presses import Press, check_presses
-from .response_fit import FEW, fit_depth_brightness
+from torchvts.calibration import CalibrationWarning, Press, by_presses
+from torchvts.calibration.contacts import Contact, used
+from torchvts.calibration.field import ContactForms, Family, power_of
+from torchvts.calibration.given_images import sort_presses
+from torchvts.calibration.posterior import Evidence, Prior
+from torchvts.calibration.presses import check_presses
+from torchvts.calibration.response_fit import FEW, fit_depth_brightness
+from torchvts.core.checks import check_image
+from torchvts.model.calibration import Calibration
+from torchvts.model.response_field import ResponseField, ResponseModel, SensorPrior, image_basis
+from torchvts.model.sensor import Sensor, check_sensor
 
 PRIOR_DEGREES = (2, 1)
 """Degrees of a type's field in position, of linear terms and of products of two."""
@@ -58,12 +57,6 @@ def fit_prior(
         ValueError, TypeError: as :func:`calibrate`.
     """
     check_sensor("sensor", sensor)
-    if not isinstance(source, str):
-        raise TypeError(f"source: expected a text, got {type(source).__name__}")
-    check_sequence("presses", presses, "Press")
-    check_sequence("others", others, "PriorUnit")
-    for k, other in enumerate(others):
-        check_record(f"others[{k}]", other, PriorUnit, "PriorUnit(background, sensor, presses) makes one")
     units = [PriorUnit(background, sensor, presses), *others]
     results = [_fitted(unit) for unit in units]
     half_mm = 0.5 * sensor.width * sensor.mm_per_pixel
@@ -164,3 +157,23 @@ def _held_out_by_groups(contacts: Sequence[Contact], half_mm: float) -> tuple[fl
         others = [contact for other in groups if other is not group for contact in other]
         total += len(group) * mean_error_deg(_pooled([others], half_mm), group)
     return (total / len(contacts),)
+
+
+def mean_error_deg(field: ResponseField, contacts: Sequence[Contact]) -> float:
+    """Mean angle between the normals of a field and those of balls, degrees."""
+    errors = [ContactForms(Family.of(field), contact).error_deg(field.tensor()) for contact in contacts]
+    return sum(errors) / len(errors)
+
+
+def fit_log_background(background: Tensor, mm_per_pixel: float) -> tuple[tuple[float, ...], ...]:
+    """``log_background`` of a :class:`SensorPrior`, by least squares.
+
+    Args:
+        background: (3, H, W), linear light.
+        mm_per_pixel: pixel pitch, mm.
+    """
+    height, width = background.shape[1:]
+    basis = image_basis(height, width, mm_per_pixel, 0.5 * width * mm_per_pixel, 4).flatten(1)
+    values = background.double().clamp_min(1e-3).log().flatten(1)
+    solution = torch.linalg.lstsq(basis.t(), values.t()).solution  # (15, 3)
+    return tuple(tuple(float(v) for v in column) for column in solution.t())

@@ -407,9 +407,9 @@ def calibration_figure(calibration: Calibration, presses: Sequence[Press]) -> Fi
         image.set_title(name + (counts if row["used"] else ", left out"), fontsize=9)
         if "center_px" not in row:
             continue
-        off, inner = _left_deg(calibration, press, row), _left_deg(calibration, press, row, INSIDE)
+        off, inner_deg = _left_deg(calibration, press, row)
         drawn = left.imshow(off, cmap="cividis", vmin=0.0, vmax=10.0)
-        left.set_title(f"off the ball by {np.nanmean(inner):.1f} degrees", fontsize=9)
+        left.set_title(f"off the ball by {inner_deg:.1f} degrees", fontsize=9)
         (x, y), reach = row["center_px"], 1.2 * row["contact_radius_px"]
         left.set(xlim=(x - reach, x + reach), ylim=(y + reach, y - reach))
         _circle(left, row)
@@ -440,8 +440,8 @@ def _circle(axes: Any, row: PressRow) -> None:
     drawn.set_path_effects(_HALO)
 
 
-def _left_deg(calibration: Calibration, press: Press, row: PressRow, share: float = 1.0) -> Array:
-    """(H, W): angle between the normals found and the ball's within a share of its contact radius, degrees; NaN elsewhere."""
+def _left_deg(calibration: Calibration, press: Press, row: PressRow) -> tuple[Array, float]:
+    """(H, W): angle between the normals found and the ball's in its contact, degrees, NaN elsewhere; and its mean well inside."""
     pitch_mm, radius_mm = calibration.sensor.mm_per_pixel, 0.5 * press.ball_diameter_mm
     with torch.no_grad():
         out = DepthPipeline.from_calibration(calibration, "fast")(press.image.detach().cpu().to(calibration.background.dtype)[None])
@@ -451,9 +451,8 @@ def _left_deg(calibration: Calibration, press: Press, row: PressRow, share: floa
     square = x.square() + y.square()
     ball = torch.stack((x.expand(height, width), y.expand(height, width), (1.0 - square).clamp_min(0.0).sqrt()))
     angle = torch.rad2deg(torch.acos((out.normal[0] * ball).sum(0).clamp(-1.0, 1.0)))
-    inside = square < (share * row["contact_radius_px"] * pitch_mm / radius_mm) ** 2
-    left: Array = angle.masked_fill(~inside, math.nan).numpy()
-    return left
+    reach = row["contact_radius_px"] * pitch_mm / radius_mm
+    return angle.masked_fill(square >= reach**2, math.nan).numpy(), float(angle[square < (INSIDE * reach) ** 2].mean())
 
 
 def save_figure(figure: Figure, path: str | Path) -> None:

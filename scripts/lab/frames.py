@@ -19,11 +19,10 @@ import torchvts
 from torchvts import export
 from torchvts.calibration import Press, calibrate, read_presses
 from torchvts.core.tables import markdown, number
-from torchvts.model import Calibration, Sensor, gs_sdk
+from torchvts.model import Calibration, Sensor
 from torchvts.normals import NormalFromMLP
 from torchvts.pipeline import DepthPipeline
 
-from .latency import measure_latency
 from .peers import peer_frame
 from .rows import Row, Size, Time
 from .speed import GS_SDK, PACES, Progress, ms, size_text, time_of
@@ -33,7 +32,6 @@ USED = ("fast", "precise")
 """Modes of frames as a user runs them."""
 
 BATCHES = (1, 4, 16, 64)
-CAMERA_FRAMES = 600
 
 
 class Unit(NamedTuple):
@@ -91,7 +89,7 @@ def batches(unit: Unit, calls: int) -> Iterator[Row]:
 
 
 def costs(unit: Unit, presses: Sequence[Press], background: Tensor | None) -> Iterator[Row]:
-    """What stands before the first frame: import, calibration, the first frame; and the delay behind a camera.
+    """What stands before the first frame: import, calibration, the first frame.
 
     The error "value" of a row is what ``method`` names, in the unit ``data``.
     """
@@ -110,12 +108,6 @@ def costs(unit: Unit, presses: Sequence[Press], background: Tensor | None) -> It
         DepthPipeline.from_calibration(unit.calibration).freeze()(unit.image)
 
     yield cost("first frame: the pipeline made, and its first depth", _s(first_frame), "s")
-    background = unit.calibration.background.float().clamp(0.0, 1.0)
-    pictures = [gs_sdk.image_to_bgr(image) for image in (background, unit.image[0])]
-    found = measure_latency(unit.calibration, pictures, frames=CAMERA_FRAMES)
-    for percent in (50.0, 95.0, 99.0):
-        yield cost(f"camera of 60 frames a second: frame to depth, {percent:.0f}th percentile", found.percentile(percent), "ms")
-    yield cost(f"camera of 60 frames a second: dropped of {found.arrived}", float(found.dropped), "frames")
 
 
 def _s(call: Callable[[], object]) -> float:
@@ -157,7 +149,7 @@ def as_user(progress: Progress, data: Path | None, calls: int = 100) -> list[Row
                 rows += frames(unit, calls)
                 torch.set_num_threads(allowed)
     unit = makers[0](SIZES[1])
-    progress("calibration, first frame, delay behind a camera")
+    progress("calibration, first frame")
     background, presses = (None, []) if data is None else read_presses(data / "gelsight_mini_a")
     return rows + list(costs(unit, [press for press in presses if press.contact_radius_px is not None][:30], background))
 
@@ -195,7 +187,7 @@ def user_table(rows: Sequence[Row]) -> str:
         lines.append([*key, *cells, number(1000.0 / times[PACES[0]].ms_median if PACES[0] in times else None, 0)])
     titles = ["unit", "size", "method", "threads", *(f"{pace}: ms, median, p90" for pace in PACES)]
     paid = [[row.method, f"{row.errors['value']:.3g} {row.data}"] for row in rows if row.kind == "cost"]
-    once = markdown(["what is paid once, or behind a camera", ""], paid)
+    once = markdown(["what is paid once", ""], paid)
     return "\n".join([markdown([*titles, "frames/s in a tight loop"], lines), "", *ratios(rows), "", once, "", machine()])
 
 

@@ -16,7 +16,7 @@ from torchvts.core.frame import DepthOutput
 from torchvts.pose import tracker as tracker_module
 from torchvts.pose.follow import follow
 from torchvts.pose.grids import Resolution, grids, surface_of
-from torchvts.pose.height_errors import MOST_MM, WHITE_MM, height_sums
+from torchvts.pose.height_errors import ALIKE_MM, MOST_MM, WHITE_MM, height_sums
 from torchvts.pose.inverse import (
     SHALLOW_MM,
     SLOPE_NOISE,
@@ -31,7 +31,7 @@ from torchvts.pose.inverse import (
 from torchvts.pose.keyframe import KeyframeGraph, make_keyframe
 from torchvts.pose.result import invert, motion, turn_deg
 from torchvts.pose.rigid import rotation_vector
-from torchvts.pose.uncertainty import ALIKE_MM, PARTS, jackknife, shared_error
+from torchvts.pose.uncertainty import PARTS, jackknife, shared_error
 from torchvts.scenes import objects, render
 
 PITCH = 0.125
@@ -524,7 +524,7 @@ def test_a_bad_frame_is_said_and_the_tracker_goes_on():
 
 def test_a_bad_reference_is_refused():
     good = press(objects.stamp("T"), objects.pose(0.0))
-    with pytest.raises(ValueError, match="reference: expected a contact of at least 60 pixels, got no contact"):
+    with pytest.raises(ValueError, match="reference: expected a contact of at least 12 pixels, got no contact"):
         vts.PoseTracker(_bad(good, contact=torch.zeros_like(good.contact)), PITCH)
     with pytest.raises(ValueError, match="reference: expected finite depth and gradient, got depth or gradient that is NaN"):
         vts.PoseTracker(_bad(good, depth_mm=good.depth_mm * math.nan), PITCH)

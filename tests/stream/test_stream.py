@@ -9,7 +9,6 @@ import re
 import signal
 import sys
 import threading
-import time
 import warnings
 from dataclasses import replace
 from functools import partial
@@ -22,7 +21,6 @@ import torch
 from conftest import Frames, write_film
 
 import torchvts as vts
-from lab.latency import measure_latency
 from torchvts import stream as streams
 from torchvts.core.files import rgb_from_bgr
 from torchvts.pipeline import unit_pipeline
@@ -811,18 +809,3 @@ def test_a_raw_video_of_a_mini_runs_without_a_camera(data, run_stream, tmp_path,
     assert done.returncode == 0, done.stderr
     rows = [row.split(",") for row in (tmp_path / "out" / "frames.csv").read_text().splitlines()[1:]]
     assert min(float(row[3]) for row in rows[14:17]) > 0.3 and max(float(row[3]) for row in rows[:14] + rows[17:]) < 0.02
-
-
-@pytest.mark.parametrize("slow", [pytest.param(False, marks=pytest.mark.long), True])
-def test_a_camera_in_real_time(unit, slow, monkeypatch):
-    """Depth of every frame in order, or of the newest where depth takes longer than a frame: none is lost without being counted."""
-    calibration, camera = unit
-    if slow:
-        both = vts.FrozenPipeline.with_conditions
-        monkeypatch.setattr(vts.FrozenPipeline, "with_conditions", lambda self, images: (time.sleep(0.05), both(self, images))[1])
-    found = measure_latency(calibration, [camera(), camera(0.5), camera(1.0)], fps=60.0, frames=40)
-    assert found.numbers == sorted(set(found.numbers)) and found.numbers[-1] < found.arrived == 40
-    assert len(found.numbers) + found.dropped == found.arrived and min(found.delay_ms) > 0.0
-    assert 0 < found.drawn <= len(found.numbers)
-    if slow:
-        assert found.dropped > 0 and found.percentile(50.0) > 50.0

@@ -163,10 +163,9 @@ def load_calibration(path: Path) -> Calibration:
     return Calibration.load(path)
 
 
-def add_out(parser: argparse._ActionsContainer, text: str, default: str | None = None) -> None:
-    """``--out``: where results go; required where there is no default."""
-    path = None if default is None else Path(default)
-    parser.add_argument("--out", type=Path, metavar="FOLDER", required=default is None, default=path, help=text)
+def add_out(parser: argparse._ActionsContainer, text: str) -> None:
+    """``--out``: where results go."""
+    parser.add_argument("--out", type=Path, metavar="FOLDER", required=True, help=text)
 
 
 def calibrated(background: Tensor, sensor: Sensor, presses: Sequence[Press], force: bool = False) -> Calibration:

@@ -21,11 +21,11 @@ from tqdm import tqdm
 from .. import viz
 from ..core.files import check_folder, make_folder, read_image, write_atomically
 from ..core.recordings import count_frames
-from ..pipeline import DepthOutput, unit_pipeline
+from ..pipeline import DepthOutput
 from ..pose import OutputFrame, contact_cloud, read_point_cloud, register_depth, register_points, write_point_cloud
 from ..pose.clouds import CLOUD_SUFFIXES
 from ..pose.result import Registration
-from ..stream import FrameCheck, frames
+from ..stream import Recording, frames
 from .options import add_length_unit, add_mode, add_network, add_out, load_calibration
 from .parser import UsageError
 
@@ -92,16 +92,14 @@ def of_clouds(arguments: argparse.Namespace, source_file: Path, target_file: Pat
 def of_frames(arguments: argparse.Namespace, unit: Path, source: Path, reference: Path) -> list[dict[str, Any]]:
     """Register every frame with the reference."""
     calibration = load_calibration(unit)
-    pipe = unit_pipeline(calibration, arguments.mode, arguments.network).requires_grad_(False).freeze()
-    pitch, check = calibration.sensor.mm_per_pixel, FrameCheck.from_calibration(calibration)
+    recording, pitch = Recording(calibration, arguments.mode, network=arguments.network), calibration.sensor.mm_per_pixel
     written = OutputFrame(arguments.length_unit, calibration.sensor)
 
     def depth_of(image: torch.Tensor) -> DepthOutput:
         image = calibration.sensor.rectify(image[None])
-        reason = check(image) if check is not None else ""
-        if reason:
+        if reason := recording.unusable(image):
             raise ValueError(f"frame: expected one that can be used: {reason}")
-        return pipe(image)
+        return recording(image)
 
     try:
         target = depth_of(read_image(reference))

@@ -28,7 +28,7 @@ from ..model import Calibration, Sensor
 from ..model.report import warnings_of
 from ..model.summary import NOT_METRIC, SHOWN, doubts_of
 from ..stream import Recording, frames, read_background, read_press_images
-from ..viz import save_figure, sheet_figure
+from ..viz import NAME_SHOWN, save_figure, sheet_figure
 from .options import add_length_unit, add_out, add_pipeline, add_unit, calibrated, contact_of, split_files
 from .parser import UsageError
 
@@ -41,8 +41,8 @@ PASSED = (
 DIAGNOSED = 20
 """So many images are diagnosed; of more, the first of each of so many folders, since each may be of another camera."""
 
-SHEET, NAME_SHOWN = 9, 30
-"""Images on the sheet, and characters of their names."""
+SHEET = 9
+"""Images on the sheet."""
 
 USAGE = "CALIBRATION INPUT... --out FOLDER"
 

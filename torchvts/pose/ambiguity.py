@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from .grids import Grid
-from .inverse import CUT, SHALLOW_MM, SLOPE_NOISE, Points, center_and_units, points_of, residual_limits, residuals
+from .inverse import CUT, LEAST_OVERLAP, SHALLOW_MM, SLOPE_NOISE, Points, center_and_units, points_of, residual_limits, residuals
 from .rigid import Array, adjoint, rigid_motion
 
 SINE_OF_AXIS = 0.3
@@ -22,9 +22,6 @@ DEEP = 0.6
 
 ROLLS = (0.5, 0.25, 0.125, 0.0625)
 """Shares of the contact's radius by which a motion is tried: only small ones leave a thin, long rod where it touches."""
-
-COMPARED = 0.3
-"""Share of the deep part's pixels that must still touch after a motion that is tried: of a rod a few pixels wide a third does."""
 
 TURNED = (3.0, 5.0, 5.0, 5.0)
 """How many times the rise of the mean squared residual the mean square must be by which normals turn, for each share of the radius.
@@ -180,7 +177,7 @@ def _rolls(grid: Grid, deep: Points, motions: Array) -> Array:
                 limits = residual_limits(grid, rigid_motion(sign * twist, deep.center), SLOPE_NOISE)
                 found = residuals(grid.channels, columns, limits)
                 compared = found.inside & (found.height > SHALLOW_MM)
-                if compared.sum() <= COMPARED * deep.number:
+                if compared.sum() <= LEAST_OVERLAP * deep.number:
                     break
                 squared = np.square(found.values[:2]).sum(0) + np.square(HEIGHT_RATIO * found.values[2])
                 rises.append(float(np.minimum(squared, (CUT * SLOPE_NOISE) ** 2)[compared].mean()))

@@ -15,7 +15,7 @@ from ..core.geometry import check_rigid
 from .ambiguity import UNKNOWN_VARIANCE, motions_of, unknown_motions
 from .follow import Followed, follow
 from .grids import DepthFrame, Grids, checked_grids, resolution_of, surface_of
-from .inverse import MOST_COST, SLOPE_NOISE, Points, Score, bare_points, center_and_units, points_of, refine, score_pose
+from .inverse import SLOPE_NOISE, Points, Score, bare_points, center_and_units, points_of, refine, score_pose
 from .keyframe import Keyframe, make_keyframe
 from .result import Registration
 from .rigid import Array, distance_mm, inverted, orthonormal, rotation_vector
@@ -24,9 +24,8 @@ from .search import search_plane
 MOST_TURNS, MOST_AGAIN = 4, 16
 """Rotations with which shifts are searched again, and hypotheses that come of it, at most."""
 
-SAME_MM, MOST_TRIED, MOST_VAIN = 0.4, 72, 8
-"""Poses that move the contact to so nearly the same place are one, mm; and so many starts are tried for equal poses at most, and
-while none fits."""
+SAME_MM, MOST_TRIED = 0.4, 72
+"""Poses that move the contact to so nearly the same place are one, mm; and so many starts are tried for equal poses at most."""
 
 EQUAL, EQUAL_COST = 2.3, 0.008
 """Poses are equal whose costs on the fine grid are within so many times the least one, or so much more. A bolt head turned by 10
@@ -173,9 +172,7 @@ def symmetries(keyframe: Keyframe) -> list[Array]:
     return [pose for pose, score in found if score.is_enough() and distance_mm(keyframe.spread, pose, np.eye(4)) > SAME_MM]
 
 
-def equal_poses(
-    keyframe: Keyframe, frame: Grids, starts: list[Array], motions: Sequence[Array] = (), most_cost: float = MOST_COST
-) -> list[Followed]:
+def equal_poses(keyframe: Keyframe, frame: Grids, starts: list[Array], motions: Sequence[Array] = ()) -> list[Followed]:
     """All poses that fit equally well, from some starts on, best first; none if nothing fits.
 
     The motions between them are symmetries of the object, and so are the products of these, which are tried too: where slopes
@@ -187,7 +184,6 @@ def equal_poses(
         starts: poses (4, 4), T_frame_keyframe.
         motions: (4, 4), symmetries of the keyframe, if they are known. Of a symmetric object that is tilted otherwise than the
             reference other pixels touch: the fine grid counts them, so a pose beside such a motion is compared on the coarse one.
-        most_cost: of a pose that is taken.
     """
     found: list[Followed] = []
     tried: list[Array] = []
@@ -196,23 +192,20 @@ def equal_poses(
     def is_new(pose: Array, others: list[Array]) -> bool:
         return all(distance_mm(keyframe.spread, pose, other) >= SAME_MM for other in others)
 
-    def fits(one: Followed) -> bool:
-        return one.free.shape[1] < 6 and one.score.is_enough(most_cost)
-
-    while waiting and len(tried) < (MOST_TRIED if found else MOST_VAIN):
+    while waiting and len(tried) < MOST_TRIED:
         start = waiting.popleft()
         if not is_new(start, tried):
             continue
         tried.append(start)
         one = follow(keyframe, frame, [start])
         known = [other.pose for other in found]
-        if not fits(one) or not is_new(one.pose, known):
+        if not one.agrees or not is_new(one.pose, known):
             continue
         found.append(one)
         if one.names:  # products of symmetries would differ by what is unknown: only what turns it otherwise is another pose
             poses = [*(one.pose @ motion for motion in motions), *waiting]
             others = [follow(keyframe, frame, [poses[k]]) for k in turned_otherwise(poses, one)]
-            others = [other for other in others if fits(other)]
+            others = [other for other in others if other.agrees]
             found += [others[k] for k in turned_otherwise([other.pose for other in others], one)]
             break
         if not known:

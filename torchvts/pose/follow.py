@@ -28,23 +28,18 @@ from .keyframe import Keyframe
 from .rigid import Array
 from .uncertainty import LEAST_SLOPE_NOISE, PARTS, covariance_of_slopes
 
-COARSE_STEPS, SOME_STEPS = 15, 30
+MOST_STEPS = 30
 """Largest number of steps on the coarse grid, and with some pixels of the fine one."""
 
-COARSE_STEP_MM, SOME_STEP_MM = 0.02, 2e-3
-"""Steps so small, at the contact, are the last ones."""
+SMALL_MM, SMALLEST_MM = 0.02, 2e-3
+"""Steps so small, at the contact, are the last ones on the coarse grid and on the fine one; where the very last step is larger than
+the first of these, the pose is not settled."""
 
 HEIGHT_OFFSET_MM = 0.02
 """Error of all heights of a contact alike, which its frames cannot show: the relief of a real GelSight Mini errs by so much."""
 
-LAST_STEP_MM = 0.03
-"""A last step of more than this, at the contact, is not the end of the way."""
-
 TRUSTED_DEG, TRUSTED_MM = 1.0, 0.15
-"""A pose is trusted if three times its standard deviations are within these."""
-
-MOST_STD_DEG, MOST_STD_MM = 1.0, 0.15
-"""Standard deviations of a motion, as a turn and as a shift, above which it is called unknown."""
+"""A pose is trusted if three times its standard deviations are within these; a motion of larger ones is called unknown."""
 
 ALIKE_PIXELS = 25.0
 """Number of fine pixels over which slope errors are alike, where it is asked whether a motion is shown at all."""
@@ -107,15 +102,15 @@ def follow(keyframe: Keyframe, frame: Grids, starts: list[Array]) -> Followed:
 
 def _follow_from(keyframe: Keyframe, frame: Grids, start: Array, last: Array) -> Followed:
     """Refine one pose on the coarse grid, on some pixels, and on many of them, and score it; what is unknown stays as it was."""
-    pose, coarse = refine(frame.coarse, keyframe.coarse, start, COARSE_STEPS, 2.0 * SLOPE_NOISE, keyframe.held, COARSE_STEP_MM)
+    pose, coarse = refine(frame.coarse, keyframe.coarse, start, MOST_STEPS, 2.0 * SLOPE_NOISE, keyframe.held, SMALL_MM)
     unknown = _sliding(keyframe, coarse)
     pose = _kept(keyframe, unknown, last, pose)
-    refined, some = refine(frame.fine, keyframe.some, pose, SOME_STEPS, SLOPE_NOISE, unknown.motions, SOME_STEP_MM)
+    refined, some = refine(frame.fine, keyframe.some, pose, MOST_STEPS, SLOPE_NOISE, unknown.motions, SMALLEST_MM)
     vague = _vague(keyframe, some)
     if vague.motions.shape[1] > 0:
         unknown = _joined(unknown, vague)
         pose = _kept(keyframe, unknown, last, pose)
-        refined, some = refine(frame.fine, keyframe.some, pose, SOME_STEPS, SLOPE_NOISE, unknown.motions, SOME_STEP_MM)
+        refined, some = refine(frame.fine, keyframe.some, pose, MOST_STEPS, SLOPE_NOISE, unknown.motions, SMALLEST_MM)
     noise = max(LEAST_NOISE, 1.5 * some.slope_noise)
     fine, matrices, rights = sum_parts(frame.fine, keyframe.many, refined, noise, PARTS)
     by_slopes = solve_step(fine, unknown.motions)
@@ -134,7 +129,7 @@ def _follow_from(keyframe: Keyframe, frame: Grids, start: Array, last: Array) ->
         names=_names(unknown, pose),
         std_deg=math.degrees(math.sqrt(float(np.diag(scaled)[:3] @ keyframe.many.units[:3] ** 2))),
         std_mm=math.sqrt(float(np.trace(scaled[3:, 3:]))),
-        settled=float(np.linalg.norm(by_slopes)) < LAST_STEP_MM,
+        settled=float(np.linalg.norm(by_slopes)) < SMALL_MM,
         covariance=covariance_after(keyframe.many, pose, scaled + unknown.motions @ unknown.motions.T * UNKNOWN_VARIANCE),
     )
 
@@ -192,7 +187,7 @@ def _sliding(keyframe: Keyframe, coarse: Sums) -> _Unknown:
 
 def _vague(keyframe: Keyframe, some: Sums) -> _Unknown:
     """Motions whose standard deviation is too large, because the common contact is small or faint."""
-    wanted = np.concatenate((math.radians(MOST_STD_DEG) / keyframe.some.units[:3], np.full(3, MOST_STD_MM)))
+    wanted = np.concatenate((math.radians(TRUSTED_DEG) / keyframe.some.units[:3], np.full(3, TRUSTED_MM)))
     alike = max(1.0, ALIKE_PIXELS * keyframe.some.number / keyframe.grids.touching)
     ratio = max(some.slope_noise, LEAST_SLOPE_NOISE) / some.noise
     matrix = some.matrix * wanted[:, None] * wanted / (alike * ratio**2)

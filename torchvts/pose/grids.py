@@ -14,8 +14,8 @@ from .rigid import Array
 LEAST_DEPTH_MM = 0.03
 """Skin less deep than this counts as the transition zone around a contact, where it does not lie on the object."""
 
-LEAST_SIDE, LEAST_PIXELS, LEAST_CELLS = 16, 60, 12
-"""Least pixels along the shorter side of a frame, in a contact, and cells of a contact on the coarse grid."""
+LEAST_SIDE, LEAST_CELLS = 16, 12
+"""Least pixels along the shorter side of a frame, and least cells of a contact on the coarse grid."""
 
 HUGE = 1e6
 """Depth, mm, and slopes beyond this are no measurement; their squares would overflow."""
@@ -158,8 +158,8 @@ def surface_of(frame: DepthFrame, name: str = "frame", with_skin: bool = False) 
     if not bool((ends <= HUGE).all()):
         raise Unusable(name, "finite depth and gradient", f"depth or gradient that is NaN, infinite or beyond {HUGE:g}")
     touching = int(np.count_nonzero(surface.contact.numpy()))
-    if touching < LEAST_PIXELS:
-        raise Unusable(name, f"a contact of at least {LEAST_PIXELS} pixels", "no contact: nothing is touched?")
+    if touching < LEAST_CELLS:
+        raise Unusable(name, f"a contact of at least {LEAST_CELLS} pixels", "no contact: nothing is touched?")
     return surface
 
 

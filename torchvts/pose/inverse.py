@@ -37,9 +37,6 @@ LEAST_NOISE, LARGEST_STEP_MM = 0.02, 0.6
 LEAST_FITNESS, LEAST_OVERLAP, MOST_COST = 0.85, 0.3, 0.25
 """Thresholds that a score must reach to be trusted."""
 
-SMALL_FITNESS, SMALL_OVERLAP = 0.955, 0.2
-"""The same where the overlap is below LEAST_OVERLAP. No pair of different objects converges with them."""
-
 COARSE_WINDOW, FINE_WINDOW = np.ones(3), np.array([1.0, 4.0, 6.0, 4.0, 1.0])
 """Weights of neighbours along each side in second derivatives, whose noise looks like information on the pose."""
 
@@ -112,9 +109,8 @@ class Score(NamedTuple):
     cost: float
 
     def is_enough(self, most_cost: float = MOST_COST) -> bool:
-        """Whether the pose can be trusted: a small common part must agree nearly everywhere."""
-        least = LEAST_FITNESS if self.overlap >= LEAST_OVERLAP else SMALL_FITNESS
-        return self.fitness >= least and self.overlap >= SMALL_OVERLAP and self.cost <= most_cost
+        """Whether the pose can be trusted."""
+        return self.fitness >= LEAST_FITNESS and self.overlap >= LEAST_OVERLAP and self.cost <= most_cost
 
 
 def center_and_units(points: Image) -> tuple[Array, Array]:

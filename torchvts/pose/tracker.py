@@ -1,9 +1,7 @@
 """Tracking: the pose of a touched object in every frame, from its pose in the last one."""
 
 import math
-from collections import deque
 from dataclasses import dataclass
-from statistics import median
 
 import numpy as np
 import torch
@@ -17,41 +15,22 @@ from .direct import equal_poses, likely_poses, message_of, symmetries
 from .dots import carried, fused, points_under
 from .follow import TRUSTED_DEG, TRUSTED_MM, Followed, follow, in_common
 from .grids import LEAST_CELLS, DepthFrame, Grids, Surface, Unusable, grids, pitch_by_slopes, surface_of
-from .inverse import LEAST_FITNESS, LEAST_NOISE, LEAST_OVERLAP, MOST_COST
+from .inverse import LEAST_FITNESS, LEAST_OVERLAP, MOST_COST
 from .keyframe import KeyframeGraph, make_keyframe
 from .result import Registration
 from .rigid import Array, cross, distance_mm, inverted, moved_covariance, orthonormal
+from .uncertainty import LEAST_SLOPE_NOISE
 
-ENOUGH, RETURN = 0.5, 0.6
-"""Share of the smaller contact in common below which a new keyframe is taken, and from which an older one is used again."""
+ENOUGH = 0.5
+"""Share of the smaller contact in common below which a new keyframe is taken, and above which an older one is used again; and share
+of the reference's contact that a keyframe must have."""
 
 VAGUER = 2.0
-"""A pose whose variance is so many times the least since the keyframe was taken up makes a new keyframe."""
-
-GAIN = 0.75
-"""Beside itself a new keyframe has at most so much of the variance that the frame has beside the present one."""
-
-LEAST_CONTACT = 0.5
-"""Share of the reference's contact that a keyframe must have at least."""
-
-GROWN = 2.0
-"""A contact of so many times the pixels of the keyframe's makes a new keyframe."""
+"""A pose whose variance is so many times the least since the keyframe was taken up makes a new keyframe; a contact of so many times
+its pixels does so too."""
 
 JUMP_MM = 1.0
 """Motion of the contact between frames, beside the expected one, beyond which a pose is not taken: another one may look alike."""
-
-RISE = 3.0
-"""A residual of so many times the usual one of a track is no noise."""
-
-LEAST_SLOPE = 1e-3
-"""A reference of smaller slopes, root mean square, is flat: noise and errors of sensors are larger."""
-
-MOVED_MM = 0.25
-"""Motion from the keyframe, at the contact, from which a residual says what is usual: frames of an object that stays, and
-above all a frame that comes again, differ from the keyframe by less, since the errors of a sensor's slopes stay where they are."""
-
-COST_RISE = 1.5
-"""The cost of a pose may be so many times the usual one of a track, where that is large as with a sensor whose slopes err."""
 
 PITCH_RATIO = 1.5
 """Ratio of the pitch that depth and slopes have and the one given, beyond which a frame has another one. It is 0.86 to 0.99 on
@@ -126,7 +105,7 @@ class PoseTracker:
         """Begin anew with another reference; all keyframes are forgotten."""
         frame = surface_of(reference, "reference")
         slope = float(frame.gradient[0][:, frame.contact[0, 0]].square().mean().sqrt())
-        if slope < LEAST_SLOPE:
+        if slope < LEAST_SLOPE_NOISE:
             raise ValueError(f"reference: expected a contact with relief, got slopes of {slope:.2g}: a flat face shows no motion")
         keyframe = make_keyframe(frame, self.mm_per_pixel)
         found = pitch_by_slopes(frame)
@@ -150,7 +129,6 @@ class PoseTracker:
         self._missed: Array | None = None  # the pose that was not taken in the last frame
         self._symmetries: list[Array] = []
         self._symmetries_of_reference: list[Array] | None = None
-        self._usual: deque[tuple[float, float]] = deque(maxlen=30)  # slope noise and cost
         self._dots = None if moved is None else points_under(moved, frame.contact)
         self._carried: Array | None = None  # the last pose, moved with the dots
         self._by_dots: Array | None = np.zeros((6, 6))  # covariance of what dots have told since the reference
@@ -229,8 +207,8 @@ class PoseTracker:
         most = self._way[self._active] + variance
         for k in range(self._active):
             share, variance = self._in_common(k, frame, expected)
-            few = frame.touching < GROWN * self.graph.keyframes[k].grids.touching
-            if few and share > RETURN and self._way[k] + variance < most:
+            few = frame.touching < VAGUER * self.graph.keyframes[k].grids.touching
+            if few and share > ENOUGH and self._way[k] + variance < most:
                 return k
         return None
 
@@ -248,24 +226,17 @@ class PoseTracker:
             self.closures.append((math.degrees(float(np.linalg.norm(twist[:3]))), float(np.linalg.norm(middle))))
         self._active, self._least = older, math.inf
 
-    def _most_cost(self) -> float:
-        """Of a pose that is taken: more, where the slopes of the sensor err."""
-        return max(MOST_COST, COST_RISE * median(cost for _, cost in self._usual)) if len(self._usual) >= 3 else MOST_COST
-
     def _problem(self, index: int, found: Followed, starts: list[Array]) -> str:
         """Why a pose cannot be trusted; empty if it can."""
-        most_cost, (fitness, overlap, cost) = self._most_cost(), found.score
-        if not found.score.is_enough(most_cost):
+        fitness, overlap, cost = found.score
+        if not found.score.is_enough():
             common = f"{100 * overlap:.0f} % of the smaller contact in common"
             if fitness >= LEAST_FITNESS and overlap < LEAST_OVERLAP:
                 return f"too little to compare near the last pose, {common}: lifted, another part of the object, or a jump"
             agrees = f"{100 * fitness:.0f} % of what is compared agrees, {common}"
-            if cost > most_cost:
-                agrees += f", mean truncated residual {cost:.2f}, {most_cost:.2f} at most"
+            if cost > MOST_COST:
+                agrees += f", mean truncated residual {cost:.2f}, {MOST_COST:g} at most"
             return f"nothing fits near the last pose: {agrees}: another part of the object, a jump, or another object"
-        usual = median([slope for slope, _ in self._usual]) if len(self._usual) >= 3 else math.inf
-        if found.fine.slope_noise > max(RISE * usual, LEAST_NOISE):
-            return f"slopes differ by {found.fine.slope_noise:.3f}, where {usual:.3f} is usual: a jump, or another object"
         if found.free.shape[1] == 6:
             return "the contact is too small: no motion of it is known"
         spread, to_reference = self.graph.keyframes[index].spread, inverted(self.graph.poses[index])
@@ -283,7 +254,7 @@ class PoseTracker:
             starts = likely_poses(keyframe, frame)
             starts.insert(1, self._poses[-1] @ back)
             motions = [chain @ motion @ back for motion in self._reference_symmetries()]
-            equal = equal_poses(keyframe, frame, starts, motions, self._most_cost())
+            equal = equal_poses(keyframe, frame, starts, motions)
             problems = [self._problem(index, one, [one.pose @ chain]) for one in equal]
             equal = [one for one, problem in zip(equal, problems, strict=True) if not problem]
             if not equal:
@@ -294,15 +265,13 @@ class PoseTracker:
             if vaguest.free.shape[1] > keyframe.held.shape[1]:
                 message = f"it touches, but too little to show its {', '.join(vaguest.names)}"
                 continue  # what is unknown now would keep a value of long ago
-            if not found.exact and frame.touching < LEAST_CONTACT * keyframe.grids.touching:
+            if not found.exact and frame.touching < ENOUGH * keyframe.grids.touching:
                 message = "it touches with a small part, which other parts of the object may look like"
                 continue
             self._symmetries = [inverted(found.pose @ chain) @ one.pose @ chain for one in equal if one is not found]
             self._poses = self._on_the_way(found.pose @ chain)
             self._active, self._least, self._tracking = index, math.inf, True
             return self._accept(contact, frame, found)
-        if self._usual:
-            self._usual.popleft()  # what was usual is forgotten while the object is not found, lest it stay lost for ever
         return self._lose(f"not found again: {message}", contact)
 
     def _on_the_way(self, pose: Array) -> list[Array]:
@@ -327,15 +296,13 @@ class PoseTracker:
         if self._carried is not None and self._by_dots is not None:
             pose, covariance = fused(pose, covariance, self._carried, self._by_dots)
         self._poses = [*self._poses[-1:], pose]
-        if distance_mm(keyframe.spread, found.pose, np.eye(4)) > MOVED_MM:
-            self._usual.append((found.fine.slope_noise, found.score.cost))
-        large = frame.touching > LEAST_CONTACT * graph.keyframes[0].grids.touching
-        grown = frame.touching > GROWN * keyframe.grids.touching
+        large = frame.touching > ENOUGH * graph.keyframes[0].grids.touching
+        grown = frame.touching > VAGUER * keyframe.grids.touching
         share, variance = in_common(keyframe, frame, found.pose)
         self._least = min(self._least, variance)
         moved_on, vague = large and share < ENOUGH, large and variance > VAGUER * self._least
         if (grown or moved_on or vague) and found.free.shape[1] <= keyframe.held.shape[1]:  # else what is unknown now would stay so
-            self._take_keyframe(contact, found, variance, math.inf if grown or moved_on else GAIN * variance)
+            self._take_keyframe(contact, found, variance)
         std_deg, std_mm = math.hypot(found.std_deg, drift_deg), math.hypot(found.std_mm, drift_mm)
         exact = found.exact and 3.0 * std_deg <= TRUSTED_DEG and 3.0 * std_mm <= TRUSTED_MM
         message = f"{100 * found.score.fitness:.0f} % of the common contact agrees"
@@ -374,13 +341,11 @@ class PoseTracker:
         degrees = math.degrees(math.sqrt(float(np.trace(drift[:3, :3]))))
         return drift, degrees, math.sqrt(float(np.trace(to_center @ drift @ to_center.T)))
 
-    def _take_keyframe(self, contact: Surface, found: Followed, variance: float, most: float) -> None:
-        """Go on with a frame as keyframe, if beside itself it has at most such a variance."""
+    def _take_keyframe(self, contact: Surface, found: Followed, variance: float) -> None:
+        """Go on with a frame as keyframe, unless it is too faint to be one."""
         try:
             keyframe = make_keyframe(contact, self.mm_per_pixel)
         except ValueError:
-            keyframe = None  # too faint to be one
-        if keyframe is None or in_common(keyframe, keyframe.grids, np.eye(4))[1] > most:
             self._least = variance  # a keyframe takes long to make: tried again when the pose is vaguer still
             return
         self._way.append(self._way[self._active] + variance)

@@ -4,12 +4,9 @@ import math
 
 import numpy as np
 
+from .height_errors import ALIKE_MM
 from .inverse import Sums
 from .rigid import Array
-
-ALIKE_MM = 3.0
-"""Errors of slopes at places so far from each other have a correlation of exp(-1/2). Presses of balls on two GelSight Minis and a
-DIGIT show 1.5 to 2 mm, but contacts of 3 mm hide what is alike all over them; drawn sensors with wide contacts have 3 mm."""
 
 PARTS = 8
 """Parts of a contact, a power of two: a pose is as uncertain as it depends on which of them is left out."""

@@ -28,8 +28,7 @@ from ..model import Calibration, Sensor, shipped_sensors
 from ..model.summary import summary_of
 from ..stream import StageClock, frames, open_source, read_background, read_press_images
 from ..stream.numbered import SourceFrames
-from ..viz import calibration_figure, save_figure
-from .guide import Guide, Session, Watch
+from .guide import Guide, Session, Watch, draw
 from .options import add_background_frames, add_press, add_sensor, calibrated, load_sensor, read_folder
 from .parser import UsageError
 from .source import add_camera_settings, play, settings_of
@@ -111,9 +110,9 @@ def by_hand(arguments: argparse.Namespace, picture: Path) -> int:
 
 def write(calibration: Calibration, presses: Sequence[Press], arguments: argparse.Namespace, picture: Path) -> int:
     """Write a calibration and its picture, and print what it is; the exit status."""
-    make_folder(picture.parent)
+    make_folder(arguments.out.parent)
     calibration.save(arguments.out)
-    save_figure(calibration_figure(calibration, check_presses(presses, calibration.sensor)), picture)
+    draw(calibration, check_presses(presses, calibration.sensor), picture)
     print(summary_of(calibration, arguments.candidates))
     print(f"wrote {arguments.out} ({arguments.out.stat().st_size / 1000:.0f} kB), and {picture}: what it was made of")
     if not calibration.metric:

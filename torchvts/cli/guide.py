@@ -20,7 +20,7 @@ from ..stream import FIRST_FRAMES, Unreadable, find_background
 from ..stream.background import check_steady, is_touched
 from ..stream.numbered import NumberedFrame
 from ..viz import calibration_figure, save_figure
-from .options import calibrated, read_folder
+from .options import calibrated, read_folder, working
 
 LONG = 300
 """Frames after which a press that is not lifted is perhaps none."""
@@ -138,6 +138,13 @@ class Watch:
         return (sum(images[1:], images[0].double()) / len(images)).float()
 
 
+def draw(unit: Calibration, presses: list[Press], picture: Path) -> None:
+    """Draw what a calibration was made of; a line says so meanwhile."""
+    make_folder(picture.parent)
+    with working(f"drawing {picture.name}"):
+        save_figure(calibration_figure(unit, presses), picture)
+
+
 class Guide:
     """What is said and done at each frame, until the calibration states the error that was asked for.
 
@@ -223,8 +230,7 @@ class Guide:
             refused = [row for row in rows.values() if row["weight"] < LEAST_WEIGHT]
             for row in refused:
                 self._refuse(row["name"], row.get("reason", ""))
-        make_folder(self.picture.parent)
-        save_figure(calibration_figure(unit, session.presses), self.picture)
+        draw(unit, session.presses, self.picture)
         self.unit, self._where = unit, where_next(unit) or self._where
         if last in rows:
             row = rows[last]

@@ -6,8 +6,10 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import NoReturn
 
 from torch import Tensor
+from tqdm import tqdm
 
 from ..calibration import CalibrationWarning, Press, calibrate, read_presses
 from ..core.checks import parse_number
@@ -166,6 +168,11 @@ def load_calibration(path: Path) -> Calibration:
 def add_out(parser: argparse._ActionsContainer, text: str) -> None:
     """``--out``: where results go."""
     parser.add_argument("--out", type=Path, metavar="FOLDER", required=True, help=text)
+
+
+def working(what: str) -> "tqdm[NoReturn]":
+    """For a ``with`` block that takes seconds: a line that says what it does, where a person looks on."""
+    return tqdm(desc=what, bar_format="{desc} ...", leave=False, disable=None)
 
 
 def calibrated(background: Tensor, sensor: Sensor, presses: Sequence[Press], force: bool = False) -> Calibration:

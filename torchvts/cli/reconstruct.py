@@ -29,7 +29,7 @@ from ..model.report import warnings_of
 from ..model.summary import NOT_METRIC, SHOWN, doubts_of
 from ..stream import Recording, frames, read_background, read_press_images
 from ..viz import NAME_SHOWN, save_figure, sheet_figure
-from .options import add_length_unit, add_out, add_pipeline, add_unit, calibrated, contact_of, split_files
+from .options import add_length_unit, add_out, add_pipeline, add_unit, calibrated, contact_of, split_files, working
 from .parser import UsageError
 
 PASSED = (
@@ -114,7 +114,8 @@ def write_sheet(unit: Calibration, inputs: list[Path], arguments: argparse.Names
             shown.append((item.path[-NAME_SHOWN:], recording(image).depth_mm[0, 0].double().numpy()))
     if len(shown) > 1 and max(depth.max() for _, depth in shown) > 0.0:
         make_folder(path.parent)
-        save_figure(sheet_figure(shown, unit.sensor.mm_per_pixel, unit.metric), path)
+        with working(f"drawing {path.name}"):
+            save_figure(sheet_figure(shown, unit.sensor.mm_per_pixel, unit.metric), path)
         print(f"wrote {path}: the first {len(shown)} images in one scale", flush=True)
 
 

@@ -93,13 +93,14 @@ class Worker:
         start = time.perf_counter()
         with tqdm(total=total, unit="frame", disable=rank > 0 or None, smoothing=0.05) as bar, ThreadPoolExecutor(writers) as pool:
             for frame, image, output in self._depths(load_frames(self.records, self.sensor, self.share, workers)):
-                bar.update(frame.length is None)
-                if not frame.done:
+                if frame.done:
+                    bar.update()
+                else:
                     waiting.append((frame, pool.submit(self._write, frame, image, output)))
                 while len(waiting) > 4 * writers:
-                    self._settle(*waiting.popleft())
-            while waiting:
-                self._settle(*waiting.popleft())
+                    bar.update(self._settle(*waiting.popleft()))
+            while waiting:  # pictures take longer than depth
+                bar.update(self._settle(*waiting.popleft()))
         done = sum_over_processes(self.done)
         seconds = time.perf_counter() - start
         if rank > 0:
@@ -155,8 +156,8 @@ class Worker:
         except ValueError as error:
             return frame._replace(failed=in_one_line(error)), None, None
 
-    def _settle(self, frame: Entry, written: "Future[str]") -> None:
-        """Count a frame whose files are in place, or report why there are none."""
+    def _settle(self, frame: Entry, written: "Future[str]") -> bool:
+        """Count a frame whose files are in place, or report why there are none; whether it is a frame, not the end of a video."""
         failed = written.result()  # a full disk is an OSError and stops the run
         if failed:
             name = frame.item.frame_name(frame.number)
@@ -168,6 +169,7 @@ class Worker:
                 tqdm.write(f"left out {name}: {failed}{more}", file=sys.stderr)
         else:
             self.done += frame.length is None
+        return frame.length is None
 
     def _write(self, frame: Entry, image: Tensor | None, result: DepthOutput | None) -> str:
         """Write a frame's files, then its record; returns why there are none, or an empty text."""

@@ -169,6 +169,16 @@ def mistaken(unit: str, draws: int, names: Sequence[str] = tuple(MISTAKES), seed
                     yield answer(unit, name, MISTAKES[name](all_of._replace(presses=presses, sensor=sensor), other))
 
 
+def every_background(unit: str, count: int = 3, seed: int = 2) -> Iterator[Answer]:
+    """Every press as the background of ``count`` others."""
+    all_of, chance = unit_of(unit), random.Random(f"{unit} {seed}")
+    for place, press in enumerate(all_of.presses):
+        others = all_of.presses[:place] + all_of.presses[place + 1 :]
+        for sensor in _sensors(all_of.sensor):
+            given = Given(press.image, sensor, chance.sample(others, min(count, len(others))))
+            yield answer(unit, "every press as background", given)
+
+
 def _sensors(sensor: Sensor) -> list[Sensor]:
     return [sensor] if sensor.prior is None else [sensor, sensor.without_prior()]
 

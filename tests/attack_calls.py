@@ -24,8 +24,8 @@ BLOCKED_S = 300.0
 """Seconds after which a call must wait for something, however busy the machine is."""
 
 CHEAP_FILES = (
-    "Calibration.load", "Calibration.save", "FrozenPipeline.load", "FrozenPipeline.save",
-    "NormalFromMLP.load", "NormalFromMLP.save", "Sensor.read_image", "Sensor.save",
+    "Calibration.load", "Calibration.save", "FrozenPipeline.load", "FrozenPipeline.save", "NormalFromLookup.load",
+    "NormalFromLookup.save", "NormalFromMLP.load", "NormalFromMLP.save", "Sensor.read_image", "Sensor.save",
     "read_image", "read_presses", "write_image", "gs_sdk.read_calibration_folder", "gs_sdk.read_labels", "stream.open_source",
 )  # fmt: skip
 """Entries whose good call is not made by test_refusals, because it needs a file, and that are called here."""

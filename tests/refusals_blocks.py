@@ -135,6 +135,8 @@ TABLE = {
         np.zeros((50, 3))],
         "slope": [torch.zeros(49, 2), torch.full((50, 2), INF), torch.zeros(50, 2, dtype=torch.int64), None],
         "bins": [2, 500, 4.5, "4"], "smoothing": [-1.0, NAN, 99.0, "1"]}),
+    "NormalFromLookup.load": Entry({"path": ...}, {"path": [*MISSING, "."]}, file=("path",), run=False),
+    "NormalFromLookup.save": Entry({"path": ...}, {"path": [*MISSING, "."]}, lambda: lookup().save, file=("path",), run=False),
     "NormalFromLookup.forward": forward(lookup, 3, "compensated", label=("depth_mm",)),
     "NormalFromMLP": Entry({"height": HEIGHT, "width": WIDTH, "flat": FLAT, "hidden": (4,), "output": "angle",
         "input_domain": "image", "blur_px": 0.0}, {"flat": images(), "hidden": [(), (0,), ("4",)], "output": ["slope", None],

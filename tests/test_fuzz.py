@@ -61,6 +61,11 @@ def network():
     return vts.NormalFromMLP(24, 32, image(), (4,))
 
 
+def lookup():
+    slope = torch.randn(100, 2, generator=torch.Generator().manual_seed(1))
+    return vts.NormalFromLookup.fit(image(), slope @ torch.ones(2, 3) * 0.1, slope, bins=4)
+
+
 def write_cloud(path, ascii_text=False):
     o3d = pytest.importorskip("torchvts.pose.read_cloud").open3d()
     points = np.random.default_rng(0).random((40, 3))
@@ -121,6 +126,7 @@ def folder_file(name):
 READERS = {
     "unit.safetensors": (lambda path: by_lights().save(path), vts.Calibration.load),
     "field.safetensors": (lambda path: by_response().save(path), vts.Calibration.load),
+    "lookup.safetensors": (lambda path: lookup().save(path), vts.NormalFromLookup.load),
     "network.safetensors": (lambda path: network().save(path), vts.NormalFromMLP.load),
     "nnmodel.pth": (lambda path: torch.save(network().gs_sdk_state(), path), lambda path: vts.NormalFromMLP.load(path, image())),
     "rig.yaml": (lambda path: vts.Sensor.load("gelsight_mini").save(path), vts.Sensor.load),

@@ -112,20 +112,21 @@ def test_one_bad_pixel_stays_alone(build):
     assert bool((same | spoilt_too).all())
 
 
-def test_a_file_gives_the_network_back(tmp_path):
-    block, images = network(torch.float64), random_images(torch.float64)
+@both
+def test_a_file_gives_the_block_back(build, tmp_path):
+    block, images = build(torch.float64), random_images(torch.float64)
     block.save(tmp_path / "block.safetensors")
-    loaded = NormalFromMLP.load(tmp_path / "block.safetensors")
+    loaded = type(block).load(tmp_path / "block.safetensors")
     assert torch.equal(loaded(images), block(images)) and not any(p.requires_grad for p in loaded.parameters())
     whole = (tmp_path / "block.safetensors").read_bytes()
     (tmp_path / "cut.safetensors").write_bytes(whole[: len(whole) // 2])
     with pytest.raises(ValueError, match=r"cut\.safetensors: not a safetensors file, or cut short"):
-        NormalFromMLP.load(tmp_path / "cut.safetensors")
+        type(block).load(tmp_path / "cut.safetensors")
     save_tensors(tmp_path / "other.safetensors", {"flat": torch.zeros(3, 4, 4)}, {"kind": "other"})
     with pytest.raises(ValueError, match=r"other\.safetensors: expected a .*, got 'other'"):
-        NormalFromMLP.load(tmp_path / "other.safetensors")
+        type(block).load(tmp_path / "other.safetensors")
     with pytest.raises(FileNotFoundError, match=r"none\.safetensors: no such file"):
-        NormalFromMLP.load(tmp_path / "none.safetensors")
+        type(block).load(tmp_path / "none.safetensors")
 
 
 # The look-up table
@@ -188,15 +189,16 @@ def test_without_smoothing_each_bin_is_the_mean_of_its_pixels():
         ({"zero_index": torch.tensor([0, 1, 4])}, "zero_index: expected three nodes of the table, 0 to 3"),
     ],
 )
-def test_a_bad_table_is_refused(change, message):
+def test_a_bad_table_is_refused(change, message, tmp_path):
     good = {
         "flat": torch.zeros(3, 4, 4),
         "table": torch.zeros(4, 4, 4, 2),
         "step": torch.ones(3),
         "zero_index": torch.tensor([1, 1, 1]),
     }
-    with pytest.raises(ValueError, match=message):
-        NormalFromLookup(**good | change)
+    save_tensors(tmp_path / "bad.safetensors", good | change, {"kind": "lookup_table"})
+    with pytest.raises(ValueError, match=rf"bad\.safetensors: damaged: {message}"):
+        NormalFromLookup.load(tmp_path / "bad.safetensors")
 
 
 # The network

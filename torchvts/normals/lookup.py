@@ -1,13 +1,17 @@
 """Normals by a look-up table from the change of colour to the slope."""
 
 import math
+from pathlib import Path
 
 import torch
 from torch import Tensor, nn
 
 from ..core.checks import check_batch, check_field, check_float_tensor, check_integer, check_least, check_same_size, check_tensor
+from ..core.files import load_tensors, save_tensors
 from ..core.geometry import normal_from_gradient
 from .base import NormalModel
+
+LOOKUP_KIND = "lookup_table"
 
 
 class NormalFromLookup(NormalModel):
@@ -141,6 +145,27 @@ class NormalFromLookup(NormalModel):
         volume[(zero[0] * bins + zero[1]) * bins + zero[2], 2] += max(1.0, 0.1 * known.shape[0])  # flat skin: slope 0
         table = _fill(volume.T.reshape(3, bins, bins, bins), known.mean(0), smoothing)
         return cls(flat, table.permute(1, 2, 3, 0), step, zero)
+
+    def save(self, path: str | Path) -> None:
+        """Write the table as one safetensors file, whole or not at all."""
+        save_tensors(path, dict(self.state_dict()), {"kind": LOOKUP_KIND})
+
+    @classmethod
+    def load(cls, path: str | Path) -> "NormalFromLookup":
+        """Read what :meth:`save` wrote. Nothing is unpickled.
+
+        Raises:
+            FileNotFoundError: no such file.
+            ValueError: not a look-up table, damaged, or cut short.
+        """
+        tensors, described = load_tensors(path)
+        names = ("flat", "table", "step", "zero_index")
+        if described.get("kind") != LOOKUP_KIND or sorted(tensors) != sorted(names):
+            raise ValueError(f"{path}: expected a look-up table with {', '.join(names)}, got {described.get('kind')!r}")
+        try:
+            return cls(tensors["flat"], tensors["table"], tensors["step"], tensors["zero_index"])
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"{path}: damaged: {error}") from error
 
     def extra_repr(self) -> str:
         return f"bins={self.table.shape[0]}, height={self.flat.shape[1]}, width={self.flat.shape[2]}"

@@ -65,10 +65,9 @@ def evaluate(data: DataSet, methods: Sequence[str] = (), *, bar: "tqdm[Any] | No
     Example:
         >>> from .sets import DataSet, Fold, Target
         >>> from torchvts.model import Sensor
-        >>> from .score import undeformed_truth
-        >>> target = Target("nothing", torch.full((3, 48, 64), 0.4), undeformed_truth(48, 64))
+        >>> target = Target("nothing", torch.full((3, 48, 64), 0.4))
         >>> data = DataSet("example", target.image, [Fold(Sensor("rig", 48, 64, 0.5), (), [target])], "")
-        >>> evaluate(data, ["flat"]).rows[0].error("relief_um")
+        >>> evaluate(data, ["flat"]).rows[0].error("lowest_mm")
         0.0
     """
     scored = [target for target in data.folds[0].scored if target.truth is not None] or data.folds[0].scored
@@ -121,7 +120,7 @@ def evaluate_all(
                 row = Row("presses", "", name, note=_reason(error))
                 done.append(Evaluation(DataSet(name, torch.zeros(3, 1, 1), (), ""), [row], [], None, {}))
             else:
-                fewer = 1 if data.refused else 2 if not data.folds[0].learned else len(IN_TABLE)
+                fewer = len(IN_TABLE) if data.folds[0].learned else 2
                 chosen = methods or IN_TABLE[:fewer]
                 bar.total = (bar.total or 0) + len(data.folds) * (len(chosen) + len(data.methods)) - 1
                 done.append(evaluate(data, chosen, bar=bar))
@@ -153,8 +152,6 @@ class _Record:
     def row(self) -> Row:
         """Summary over all frames."""
         method, built, notes, errors = self.method, self.built, list(dict.fromkeys(self.failures)), summary(self.scores)
-        if self.data.refused and method.learns:
-            notes = ["refused, as is right: " + notes[0] if notes else "not refused, though no depth is possible"]
         if method.learns and (given := sum(len(fold.learned) for fold in self.data.folds)):
             errors |= {"used": float(sum(ready.used for ready in built)), "given": float(given)}
         return Row(
@@ -180,7 +177,7 @@ def summary(scores: Sequence[PressScore]) -> dict[str, float | None]:
 
 
 _MEANS = ("normal_deg", "depth_normal_deg", "relief_um", "tilt_um", "level_um", "depth_um")
-_MEDIANS = ("radius_percent", "center_px", "iou", "area_percent", "stray_px", "lowest_mm")
+_MEDIANS = ("radius_percent", "iou", "lowest_mm")
 
 
 def _score(target: Target, out: DepthOutput, mm_per_pixel: float, method: str) -> PressScore:
@@ -195,9 +192,7 @@ def _choose(data: DataSet, methods: Sequence[str]) -> list[Method]:
     for name in methods:
         if name not in COMPARED:
             raise ValueError(f"methods: expected some of {', '.join(repr(m) for m in COMPARED)}, got {name!r}")
-    prior = data.folds[0].sensor.prior is not None
-    names = methods or [name for name in COMPARED if prior or not METHODS[name].needs_prior]
-    return [METHODS[name] for name in names] + list(data.methods)
+    return [METHODS[name] for name in methods or COMPARED] + list(data.methods)
 
 
 def _reason(error: Exception) -> str:
@@ -232,8 +227,6 @@ COLUMNS = (
     error_column("depth um", "depth_um", 0),
     error_column("radius %", "radius_percent", 1),
     _with_worst("contact IoU", "iou", 2),
-    error_column("contact area %, median", "area_percent", 0),
-    error_column("stray contact px, median", "stray_px", 0),
     Column("presses used", _used),
     _with_worst("lowest mm", "lowest_mm", 3),
     Column("frames", lambda row: str(row.frames)),

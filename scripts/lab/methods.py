@@ -67,7 +67,6 @@ class Method:
         ours: whether it is a method of this library, and not of a peer.
         learns: whether the presses influence it, so that every fold of a cross-validation needs its own.
         seen: whether it may have learned from the very presses that it is scored on.
-        needs_prior: whether it is a variant for sensors that have a prior.
     """
 
     name: str
@@ -77,7 +76,6 @@ class Method:
     ours: bool = True
     learns: bool = True
     seen: bool = False
-    needs_prior: bool = False
 
     def calibrated(self, calibration: Calibration) -> Built:
         """The method for a calibrated unit.
@@ -220,9 +218,8 @@ def given_network(training: Training, path: str | Path) -> Built:
     return _as_gs_sdk(NormalFromMLP.load(path, training.background), training, f"{Path(path).name}: trained before")
 
 
-def by_calibration(training: Training, mode: str, prior: bool = True) -> Built:
-    """What a user gets: calibration by the presses, with or without the prior of the sensor."""
-    training = training if prior else training.without_prior
+def by_calibration(training: Training, mode: str) -> Built:
+    """What a user gets: calibration by the presses, with the prior of the sensor."""
     notes = ["calibrate chose point lights"] * (training.calibration.response is None)
     if training.sensor.prior is not None:
         notes.append(f"prior fitted on {training.sensor.prior.source or 'a unit that it does not name'}")
@@ -330,8 +327,6 @@ METHODS: dict[str, Method] = {
         Method("point lights", from_presses=point_lights, learns=False),
         Method("look-up table", _lookup_by_rendered_balls, lookup_table, ours=False),
         Method("MLP", from_presses=network, ours=False),
-        Method("fast, no prior", from_presses=partial(by_calibration, mode="fast", prior=False), needs_prior=True),
-        Method("precise, no prior", from_presses=partial(by_calibration, mode="precise", prior=False), needs_prior=True),
     )
 }
 """Every method by its name."""

@@ -9,12 +9,9 @@ from torch import Tensor
 
 from torchvts.calibration import Press
 from torchvts.core.geometry import normal_from_gradient, pixel_grid_mm
-from torchvts.training.balls import RIM_PX, Truth, ball_truth, label
+from torchvts.training.balls import RIM_PX, Truth, ball_truth
 
 from .metrics import fit_sphere, mask_iou, normal_angle_deg
-
-STRAY_RADII = 2.5
-"""Contact that is found so many contact radii and more from the center of a ball is stray."""
 
 
 @dataclass(frozen=True)
@@ -33,10 +30,7 @@ class PressScore:
         depth_um: mean difference of depth and truth, micrometres: below zero depth is too small; None where truth is known up to a
             constant only, as of balls whose depth below the undeformed skin nobody measured.
         iou: intersection over union of the contact found and the true one.
-        area_percent: area of the contact found against that of the true one, percent; above zero it is too large.
-        stray_px: pixels of contact farther from the center of a ball than :data:`STRAY_RADII` contact radii.
         radius_percent: error of the radius of a sphere fitted to the depth of a ball, percent; None where the depth is a plane.
-        center_px: error of the centre of that sphere, pixels.
     """
 
     press: str
@@ -48,10 +42,7 @@ class PressScore:
     tilt_um: float | None = None
     depth_um: float | None = None
     iou: float | None = None
-    area_percent: float | None = None
-    stray_px: int | None = None
     radius_percent: float | None = None
-    center_px: float | None = None
 
     @property
     def level_um(self) -> float | None:
@@ -59,12 +50,6 @@ class PressScore:
         if self.relief_um is None or self.tilt_um is None:
             return None
         return math.sqrt(max(0.0, self.relief_um**2 - self.tilt_um**2))
-
-
-def undeformed_truth(height: int, width: int) -> Truth:
-    """The truth of a frame that nothing touches: zero everywhere."""
-    zero = torch.zeros(1, 2, height, width, dtype=torch.float64)
-    return Truth(zero[:, :1], zero, zero[:, :1] == 0, zero[:, :1] != 0)
 
 
 def score_press(
@@ -94,10 +79,9 @@ def score_press(
             f"press: '{press.name}' has {int(truth.region.sum())} pixels {RIM_PX:g} px inside its contact radius of "
             f"{press.contact_radius_px:g} px, 10 are needed: pressed too faintly, or outside of the image"
         )
-    radius_percent, center_px = _sphere_error(press, depth_mm.detach().cpu().double(), truth, mm_per_pixel)
+    radius_percent = _radius_percent(press, depth_mm.detach().cpu().double(), truth, mm_per_pixel)
     score = score_surface(truth, depth_mm, normal, mm_per_pixel, press.name, method, contact)
-    stray = None if contact is None else _stray_px(press, contact)
-    return dataclasses.replace(score, radius_percent=radius_percent, center_px=center_px, stray_px=stray)
+    return dataclasses.replace(score, radius_percent=radius_percent)
 
 
 def score_surface(
@@ -116,10 +100,10 @@ def score_surface(
     Raises:
         ValueError: wrong shapes, or an empty region.
     Example:
-        >>> flat = undeformed_truth(8, 8)
-        >>> score = score_surface(flat, torch.full((1, 1, 8, 8), -0.1), normal_from_gradient(flat.gradient), 0.1, "nothing")
-        >>> round(score.lowest_mm, 3), score.relief_um, score.normal_deg
-        (-0.1, 0.0, 0.0)
+        >>> truth = ball_truth(Press(torch.zeros(3, 31, 31), 6.0, "middle", (15.0, 15.0), 13.0), 31, 31, 0.1)
+        >>> score = score_surface(truth, truth.depth_mm - 0.1, normal_from_gradient(truth.gradient), 0.1, "too low")
+        >>> abs(round(score.relief_um, 6)), round(score.normal_deg, 6)
+        (0.0, 0.0)
     """
     if not bool(truth.region.any()):
         raise ValueError(f"truth: expected at least one pixel to score, '{name}' has none: nothing touches")
@@ -127,7 +111,6 @@ def score_surface(
     true_normal = normal_from_gradient(truth.gradient)
     slope = torch.stack(torch.gradient(depth[0, 0], spacing=mm_per_pixel)[::-1])[None]  # torch gives rows first
     error = (depth - truth.depth_mm)[0, 0][region]
-    compared = None if contact is None or truth.contact is None else (contact.cpu(), truth.contact)
     return PressScore(
         press=name,
         method=method,
@@ -137,20 +120,8 @@ def score_surface(
         relief_um=1000.0 * float(error.std(correction=0)),
         tilt_um=1000.0 * _tilt(error, torch.nonzero(region).t()),
         depth_um=1000.0 * float(error.mean()) if truth.from_undeformed else None,
-        iou=None if compared is None else mask_iou(*compared),
-        area_percent=None if compared is None or not bool(compared[1].any()) else _area_percent(*compared),
+        iou=None if contact is None or truth.contact is None else mask_iou(contact.cpu(), truth.contact),
     )
-
-
-def _area_percent(contact: Tensor, truth: Tensor) -> float:
-    return 100.0 * (int(contact.sum()) / int(truth.sum()) - 1.0)
-
-
-def _stray_px(press: Press, contact: Tensor) -> int:
-    """Pixels of contact (1, 1, H, W) far off the ball."""
-    (center_x, center_y), contact_radius_px = label(press)
-    y, x = (place.double() for place in contact[0, 0].nonzero().cpu().unbind(1))
-    return int((torch.hypot(x - center_x, y - center_y) > STRAY_RADII * contact_radius_px).sum())
 
 
 def _tilt(error: Tensor, place: Tensor) -> float:
@@ -160,8 +131,8 @@ def _tilt(error: Tensor, place: Tensor) -> float:
     return float(plane.std(correction=0))
 
 
-def _sphere_error(press: Press, depth_mm: Tensor, truth: Truth, mm_per_pixel: float) -> tuple[float | None, float | None]:
-    """Radius error in percent and centre error in pixels of the sphere through the depth; None for a plane."""
+def _radius_percent(press: Press, depth_mm: Tensor, truth: Truth, mm_per_pixel: float) -> float | None:
+    """Error of the radius of the sphere through the depth, percent; None for a plane."""
     height, width = depth_mm.shape[2:]
     x, y = pixel_grid_mm(height, width, mm_per_pixel, torch.float64)
     columns = torch.stack((x.expand(height, width), y.expand(height, width), torch.ones(height, width, dtype=torch.float64)), -1)
@@ -169,13 +140,8 @@ def _sphere_error(press: Press, depth_mm: Tensor, truth: Truth, mm_per_pixel: fl
     z = depth_mm[0, 0][region]
     plane = torch.linalg.lstsq(columns[region], z[:, None]).solution[:, 0]
     if float((columns[region] @ plane - z).abs().max()) < 1e-6:
-        return None, None
+        return None
     sphere = fit_sphere(depth_mm, mm_per_pixel, truth.region)
     if not math.isfinite(sphere.radius_mm):
-        return None, None
-    (center_x, center_y), _ = label(press)
-    # the point frame has y up
-    at_x = sphere.center_mm[0] / mm_per_pixel + (width - 1) / 2
-    at_y = -sphere.center_mm[1] / mm_per_pixel + (height - 1) / 2
-    away_px = math.hypot(at_x - center_x, at_y - center_y)
-    return 100.0 * abs(sphere.radius_mm / (0.5 * press.ball_diameter_mm) - 1.0), away_px
+        return None
+    return 100.0 * abs(sphere.radius_mm / (0.5 * press.ball_diameter_mm) - 1.0)

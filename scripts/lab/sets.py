@@ -20,7 +20,7 @@ from torchvts.calibration import RESPONSE_BLUR_PX, Press, fit_prior, read_presse
 from torchvts.cli.options import cut_frames
 from torchvts.compensate import Compensate
 from torchvts.core.checks import check_image, check_integer
-from torchvts.core.files import read_image, rgb_from_bgr
+from torchvts.core.files import read_image
 from torchvts.core.geometry import GradientFromNormal
 from torchvts.core.recordings import image_files
 from torchvts.integration import poisson_dct
@@ -29,14 +29,12 @@ from torchvts.normals import NormalFromMLP
 from torchvts.pipeline import DepthPipeline
 from torchvts.scenes import Scene
 from torchvts.skin import ZeroBackground
-from torchvts.stream.sources import open_source
 from torchvts.training.balls import Truth, ball_truth, label
 from torchvts.training.presses import with_centers
 
 from .drawn_sensors import SEEDS, drawn_sensor
 from .methods import Method, shipped_prior, with_network
 from .rims import visible_rim
-from .score import undeformed_truth
 
 CHANGED = 15.0 / 255.0
 """A pixel of gelsight_mini_b is scored where a channel has changed by more than this."""
@@ -85,7 +83,6 @@ class DataSet:
         folds: one fold or more.
         how: what is held out, and where the truth comes from.
         methods: methods that only this set has.
-        refused: the right answer is a refusal.
     """
 
     name: str
@@ -93,7 +90,6 @@ class DataSet:
     folds: Sequence[Fold]
     how: str
     methods: tuple[Method, ...] = ()
-    refused: bool = False
 
 
 # a folder of presses
@@ -267,27 +263,6 @@ def _pale_by_rims(folder: Path, limit: int | None) -> DataSet:
     return dataclasses.replace(data, name=folder.name, folds=folds, how=f"half learned from, half scored, both ways; {how}")
 
 
-def _ninedtact(folder: Path, limit: int | None) -> DataSet:
-    background, image = (read_image(folder / name) for name in ("background.png", "ball_8mm.png"))
-    sensor = Sensor("ninedtact", background.shape[1], background.shape[2], 0.05)
-    folds = [Fold(sensor, (Press(image, 8.0, "ball_8mm"),), (Target("ball_8mm", image),))]
-    return DataSet(
-        folder.name, background, folds, "white light: photometric stereo is not possible, a refusal is right", refused=True
-    )
-
-
-def _wedge(folder: Path, limit: int | None) -> DataSet:
-    """The ten frames before the contact: five make the background, the others must read zero."""
-    sensor, reader = Sensor.load("gelsight_wedge"), open_source(folder / "golf_ball.avi")
-    read = [pixels for pixels in (reader.read() for _ in range(10)) if isinstance(pixels, np.ndarray)]
-    reader.close()
-    frames = sensor.rectify(torch.stack([rgb_from_bgr(pixels) for pixels in read]))
-    truth = undeformed_truth(sensor.height, sensor.width)
-    targets = [Target(f"frame {k}", frames[k], truth) for k in range(5, len(frames))]
-    how = "frames before the contact: depth and contact must be zero; background: median of the first five"
-    return DataSet(folder.name, frames[:5].median(0).values, [Fold(sensor, (), targets)], how)
-
-
 def _halves(name: str, background: Tensor, sensor: Sensor, presses: Sequence[Press], remark: str = "") -> DataSet:
     """Half of the presses is learned from and the other half scored, and the other way round."""
     folds, notes = [], [remark] if remark else []
@@ -328,8 +303,6 @@ REAL: dict[str, Callable[[Path, int | None], DataSet]] = {
     "gelslim_mcube": _balls,
     "wyh_wedge_markers": partial(_balls, remark="its labels are 2 to 6 px from located centers, and not used", labelled=False),
     "wyh_wedge_clear": _balls,
-    "ninedtact_white": _ninedtact,
-    "wedge_video": _wedge,
 }
 """How the folder of each real sensor is read: (the folder, at most so many presses) to a :class:`DataSet`."""
 

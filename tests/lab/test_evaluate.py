@@ -71,18 +71,11 @@ def test_an_exact_press_has_no_error(press):
     given, scene = press
     score = score_press(given, scene.depth_mm, scene.normal, PITCH, "exact")
     assert score.normal_deg < 1e-3 and score.relief_um < 1e-2
-    assert score.radius_percent < 1e-2 and score.center_px < 1e-2
+    assert score.radius_percent < 1e-2
     assert (score.press, score.method) == ("exact", "exact")
     assert bool(scene.contact[ball_truth(given, HEIGHT, WIDTH, PITCH).region].all())
     assert score.depth_normal_deg < 0.05 and score.lowest_mm == 0.0 and score.iou is None
     assert score_press(given, scene.depth_mm, scene.normal, PITCH, contact=scene.contact).iou > 0.97
-    wide = scene.contact.clone()
-    wide[..., :2, :3] = True  # a corner, far from the ball
-    found = [score_press(given, scene.depth_mm, scene.normal, PITCH, contact=mask) for mask in (scene.contact, wide)]
-    exact, more = found
-    assert (exact.stray_px, more.stray_px) == (0, 6) and abs(exact.area_percent) < 3.0
-    grown = 100.0 * 6 / int(ball_truth(given, HEIGHT, WIDTH, PITCH).contact.sum())
-    assert more.area_percent - exact.area_percent == pytest.approx(grown)
 
 
 def test_a_turned_normal_is_off_by_its_angle(press):
@@ -109,7 +102,7 @@ def test_a_scaled_depth_is_off_by_its_scale(press):
     assert score.relief_um == pytest.approx(100.0 * float(cap.std(correction=0)), rel=1e-3)
     assert score.tilt_um < 1e-2 * score.relief_um  # a ball in the middle scaled is no plane
     # a flat cap of height h over a circle a has radius a^2 / 2h: 10 % higher, a tenth smaller
-    assert score.radius_percent == pytest.approx(9.0, abs=1.5) and score.center_px < 1e-2
+    assert score.radius_percent == pytest.approx(9.0, abs=1.5)
 
 
 def test_a_tilted_depth_moves_the_fitted_ball(press):
@@ -120,7 +113,6 @@ def test_a_tilted_depth_moves_the_fitted_ball(press):
     truth = ball_truth(given, HEIGHT, WIDTH, PITCH)
     assert score.relief_um == pytest.approx(1000.0 * float(tilt[truth.region].std(correction=0)), rel=1e-3)
     assert score.tilt_um == pytest.approx(score.relief_um, rel=1e-3) and score.level_um < 0.05 * score.relief_um
-    assert score.center_px == pytest.approx(slope * 0.5 * BALL_MM / PITCH, rel=0.15)
 
 
 def test_accuracy_writes_tables_rows_and_pictures(run_script, monkeypatch, folder, tmp_path):
@@ -129,7 +121,7 @@ def test_accuracy_writes_tables_rows_and_pictures(run_script, monkeypatch, folde
     assert done.returncode == 0, done.stderr
     document = json.loads((tmp_path / "scores.json").read_text())
     summary = {row["method"]: row for row in document["rows"]}
-    assert list(summary) == [name for name in ev.COMPARED if "no prior" not in name]  # the file has none
+    assert list(summary) == list(ev.COMPARED)
     assert len(document["scores"]) == 5 * len(summary) and document["command"].startswith("python scripts/accuracy.py ")
     # exact lights, little noise: the model is right, and learning from three presses beats zero depth
     assert summary["point lights"]["errors"]["normal_deg"] < 1.5
@@ -204,8 +196,6 @@ def test_a_method_or_a_set_that_fails_is_a_row_with_its_reason(folder, monkeypat
     assert len(calls) == 2  # once for each fold, not for each method
     assert [row.note for row in result.rows[1:]] == ["presses: no contact/ in any of them"] * 2
     assert result.rows[1].frames == 0 and result.rows[1].errors["used"] == 0.0 and result.rows[0].frames == 5
-    refused = ev.evaluate(dataclasses.replace(data, refused=True), ["fast"])
-    assert refused.rows[0].note == "refused, as is right: presses: no contact/ in any of them"
     missing = ev.evaluate_all(["digit_a"], tmp_path)
     assert "no such folder: set TORCHVTS_DATA" in missing[0].rows[0].note
     text = ev.write_tables([result, *missing], tmp_path, "a command")
@@ -226,7 +216,7 @@ def test_real_sets_are_read(data, monkeypatch, name):
     sensor = read.folds[0].sensor
     assert read.background.shape == (3, sensor.height, sensor.width) and read.how
     names = [{press.name for press in fold.learned} & {target.name for target in fold.scored} for fold in read.folds]
-    assert read.refused or not any(names)
+    assert not any(names)
     assert all(target.image.shape == read.background.shape for fold in read.folds for target in fold.scored)
 
 

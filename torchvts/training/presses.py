@@ -46,11 +46,6 @@ class Training:
         return self._attempt
 
     @cached_property
-    def without_prior(self) -> "Training":
-        """The same presses, and a sensor without a prior."""
-        return self if self.sensor.prior is None else Training(self.background, self.presses, self.sensor.without_prior())
-
-    @cached_property
     def found(self) -> list[Press | None]:
         """The presses with the centres and contact radii that the calibration found; None where it left one out."""
         if not self.presses:

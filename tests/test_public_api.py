@@ -49,7 +49,7 @@ print([name for name in sys.modules if name.startswith(("torch._dynamo", "torch.
 
 
 def test_import_command_and_calibration_load_no_more_than_they_need():
-    """The import, beyond torch, three small packages, and neither Kornia nor torch's own compilers: 0.2 s where nothing else runs."""
+    """The import, beyond torch, three small packages, and neither Kornia nor torch's compilers: 0.2 s where nothing else runs."""
     done = subprocess.run([sys.executable, "-W", "ignore", "-c", PROGRAM], capture_output=True, text=True, check=True)
     by_import, *said = done.stdout.splitlines()
     packages = {name.split(".")[0] for name in by_import.split()} - set(sys.stdlib_module_names)

@@ -191,7 +191,7 @@ TABLE = {
     "PoissonDST.forward": Entry({"gradient": GRADIENT}, {"gradient": batches(2)}, lambda: vts.PoissonDST()),
     **{f"{name}.forward": Entry({"gradient": GRADIENT}, {}, lambda name=name: integrator(name)())
         for name in ("PoissonBackground", "PoissonDCT")},
-    "AdaptiveIntegration.forward": Entry({"gradient": GRADIENT}, {}, lambda: vts.AdaptiveIntegration()),
+    "AdaptiveIntegration.forward": Entry({"gradient": GRADIENT}, {"gradient": batches(2)}, lambda: vts.AdaptiveIntegration()),
     "Press": Entry(
         {"image": image(), "ball_diameter_mm": 6.0, "center_px": (4.0, 5.0), "contact_radius_px": 3.0},
         {"ball_diameter_mm": NUMBER, "center_px": [(1.0,), "here", (NAN, 0.0)], "contact_radius_px": ["3", 0, -1.0, NAN]},

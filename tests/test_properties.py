@@ -29,7 +29,7 @@ settings.register_profile(
 )
 settings.register_profile("long", max_examples=300, deadline=None, database=None, suppress_health_check=SLOW)
 settings.load_profile("long" if LONG else "short")
-FRAMES = 10_000 if LONG else 300
+FRAMES = 10_000 if LONG else 150
 
 HEIGHT, WIDTH, PITCH = 48, 64, 0.6
 MODES = ("fast", "precise")
@@ -278,7 +278,7 @@ def test_threads_may_make_the_first_calls_of_a_pipeline():
     calibration = unit("response")
     images = [press_image(calibration, kind) for kind in ("press", "border", "no contact", "holes")]
     alone = [vts.DepthPipeline.from_calibration(calibration)(image) for image in images]
-    for _ in range(20):
+    for _ in range(8):
         pipe = vts.DepthPipeline.from_calibration(calibration)
         found = in_threads([lambda k=k, pipe=pipe: [pipe(images[k]) for _ in range(3)] for k in range(len(images))])
         assert all(torch.equal(a, b) for k, outs in enumerate(found) for out in outs for a, b in zip(out, alone[k], strict=True))
@@ -334,7 +334,7 @@ def resident_bytes():
 
 
 @pytest.mark.skipif(not Path("/proc/self/statm").is_file(), reason="no /proc here")
-@pytest.mark.parametrize("by", ["lights", "response"])
+@pytest.mark.parametrize("by", ["lights", pytest.param("response", marks=pytest.mark.long)])
 @pytest.mark.parametrize("mode", MODES if LONG else ["precise"])
 def test_memory_stays_flat_over_many_frames(by, mode):
     calibration = unit(by, 24, 32, 2.0 * PITCH)

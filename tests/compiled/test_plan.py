@@ -199,6 +199,7 @@ def program(tmp_path_factory):
     return folder / "depth"
 
 
+@pytest.mark.long
 def test_the_example_in_cpp_gives_the_depth_of_python(saved, program, tmp_path):
     path, frozen, images = saved
     pixels = (images[0] * 255.0).round().to(torch.uint8).permute(1, 2, 0).contiguous().numpy()

@@ -136,12 +136,6 @@ def test_no_contact_and_all_contact():
     assert (integrate(tilt) - vts.poisson_background(tilt, PITCH)).abs().max() < 1e-3
 
 
-def test_single_precision_follows_double_precision():
-    gradient = noisy(cliff("cylinder"))
-    exact, single = integrate(gradient), integrate(gradient.float())
-    assert single.dtype == torch.float32 and (single.double() - exact).abs().max() < 0.1 * PITCH
-
-
 def test_a_flipped_image_gives_flipped_depth():
     gradient = noisy(cliff("wedge"))
     flipped = -gradient.flip(2, 3)

@@ -24,7 +24,9 @@ def _same(one, other):
     )
 
 
-@pytest.mark.parametrize("corruption", CORRUPTIONS.values(), ids=lambda corruption: corruption.name)
+@pytest.mark.parametrize(
+    "corruption", [pytest.param(c, id=c.name, marks=[pytest.mark.long] * (k % 3 > 0)) for k, c in enumerate(CORRUPTIONS.values())]
+)
 def test_a_corruption_makes_valid_cases_that_repeat_by_seed_and_differ_by_severity(corruption):
     assert 5 <= len(corruption.severities) <= 7
     rises = [b > a for a, b in zip(corruption.severities, corruption.severities[1:])]

@@ -22,7 +22,10 @@ def pipeline(lights, sensor, mode="precise", **options):
 
 @pytest.mark.parametrize(
     "press_mm, mode, largest_px, rms_px",
-    [(1.0, "fast", 0.35, 0.16), (1.0, "precise", 0.13, 0.03), (2.0, "fast", 1.3, 0.58), (2.0, "precise", 0.19, 0.03)],
+    [
+        *(pytest.param(1.0, *most, marks=pytest.mark.long) for most in (("fast", 0.35, 0.16), ("precise", 0.13, 0.03))),
+        *[(2.0, "fast", 1.3, 0.58), (2.0, "precise", 0.19, 0.03)],
+    ],
 )
 @pytest.mark.parametrize("rotation_deg", [10.0, pytest.param(75.0, marks=pytest.mark.long)])
 def test_figure_3_of_the_paper(ring, press_mm, mode, largest_px, rms_px, rotation_deg):
@@ -58,7 +61,7 @@ def with_shadows(pipe):
     return pipe
 
 
-@pytest.mark.parametrize("press_mm, largest_px, rms_px", [(1.0, 0.55, 0.12), (2.0, 0.85, 0.20)])
+@pytest.mark.parametrize("press_mm, largest_px, rms_px", [pytest.param(1.0, 0.55, 0.12, marks=pytest.mark.long), (2.0, 0.85, 0.20)])
 def test_a_worn_unit_with_low_lights(worn_unit, press_mm, largest_px, rms_px):
     calibration, camera = worn_unit
     scene = scenes.sphere_press(10.0, press_mm)
@@ -119,7 +122,8 @@ def test_of_two_slopes_that_fit_where_a_light_is_blocked_the_right_one_is_taken(
     assert share_of_the_plain_inverse(lights, scenes.sphere_press(10.0, press_mm), noise_std) < 0.25
 
 
-@pytest.mark.parametrize("radius_mm, press_mm, tilt_deg", [(4.8, 0.77, 2.6), pytest.param(5.5, 1.0, 2.0, marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("radius_mm, press_mm, tilt_deg", [(4.8, 0.77, 2.6), (5.5, 1.0, 2.0)])
 def test_walls_beyond_the_plane_of_the_lit_lights_are_found(ring, radius_mm, press_mm, tilt_deg):
     """Of a punch with a flat top, whose foot lies beyond the plane, where no start near the shallow slope leads: it left 0.9."""
     lights = ring(31.0, 18.0, rotation_deg=42.0, level=0.21)
@@ -183,7 +187,7 @@ def dimmed(lights, factors):
 
 
 @pytest.mark.parametrize("mode, radius_mm, press_mm", [("fast", 10.0, 1.0), ("precise", 40.0, 2.0)])
-@pytest.mark.parametrize("factors", [(0.9, 1.0, 1.0), (1.1, 0.85, 0.95), (0.5, 0.5, 0.5), (0.6, 1.2, 0.9)])
+@pytest.mark.parametrize("factors", [(0.5, 0.5, 0.5), (0.6, 1.2, 0.9)])
 def test_leds_that_have_dimmed_change_nothing(ring, small_sensor, small_press, factors, radius_mm, press_mm, mode):
     """Contacts of 5 and 40 % of the image."""
     lights, scene = ring(), small_press(press_mm, (2.0, 1.0), radius_mm)
@@ -292,7 +296,7 @@ def test_three_passes_are_as_good_as_many(mixed, small_sensor):
     assert pipe.normals.passes == 3 and (pipe(frames[1:2]).depth_mm - three).abs().max() < 0.01 * small_sensor.mm_per_pixel
 
 
-@pytest.mark.parametrize("center_mm", [(20.0, 0.0), (-20.0, -15.0)])
+@pytest.mark.parametrize("center_mm", [(-20.0, -15.0), pytest.param((20.0, 0.0), marks=pytest.mark.long)])
 def test_contact_that_the_image_border_cuts(ring, center_mm):
     lights, scene = ring(), scenes.sphere_press(10.0, 1.0, center_mm)
     out = pipeline(lights, FULL)(scenes.render(scene, lights))
@@ -451,11 +455,14 @@ def test_a_block_that_is_put_in_afterwards_is_no_silent_spare(mixed, small_senso
         setattr(pipe, name, nn.Identity())
 
 
-def test_an_integrator_of_another_pitch_is_refused(mixed, small_sensor):
+def test_a_block_of_another_pitch_is_refused(mixed, small_sensor):
     with pytest.raises(ValueError, match=r"integrate: expected a pitch of 0.25 mm per pixel, got PoissonDST with 1"):
         pipeline(mixed[0], small_sensor, "fast", integrate=vts.PoissonDST())
     with pytest.raises(ValueError, match=r"integrate: expected a pitch of 0.25 mm per pixel, got PoissonDCT with 0.5"):
         PerspectiveIntegration(0.25, 20.0, vts.PoissonDCT(0.5))
+    normals = vts.NormalFromIntensity(mixed[0], small_sensor.height, small_sensor.width, 0.5)
+    with pytest.raises(ValueError, match=r"normals: expected a pitch of 0\.25 mm per pixel, got NormalFromIntensity with 0\.5"):
+        pipeline(mixed[0], small_sensor, "fast", normals=normals)
 
 
 @pytest.mark.parametrize("mode", ["fast", "precise"])
@@ -545,8 +552,8 @@ def test_defects_take_the_value_of_their_neighbours():
     assert repaired[0, 0, 0, 0] == (2 * image[0, 0, 0, 1] + 2 * image[0, 0, 1, 0]) / 4
 
 
-@pytest.mark.parametrize("height_mm, out_mm, albedo, noise_std", [(30.0, 25.0, 1000.0, 0.002), (15.0, 24.0, 450.0, 0.005)])
-def test_a_dimmed_led_costs_nothing_on_rigs_that_saturate(height_mm, out_mm, albedo, noise_std):
+def test_a_dimmed_led_costs_nothing_on_rigs_that_saturate():
+    height_mm, out_mm, albedo, noise_std = 15.0, 24.0, 450.0, 0.005
     angles = torch.deg2rad(torch.tensor([0.0, 120.0, 240.0]))
     position = torch.stack((out_mm * angles.cos(), out_mm * angles.sin(), torch.full((3,), height_mm)), dim=1)
     lights = vts.PointLights(position, [albedo] * 3)

@@ -184,22 +184,6 @@ def dissimilar() -> Tensor:
     return images.clamp(0.0, 1.0)
 
 
-@pytest.mark.parametrize("kind, mode", [("lights", "precise"), ("response", "fast")])
-def test_a_frame_of_a_batch_is_that_frame_alone(kind: str, mode: str) -> None:
-    """Frozen bit for bit, plain but for rounding."""
-    pipe, images = vts.DepthPipeline.from_calibration(unit_of(kind), mode), dissimilar()
-    frozen = pipe.freeze()
-    assert frozen.compiled, frozen.not_compiled
-    batch, together = pipe(images), frozen(images)
-    for i in range(len(images)):
-        for whole, alone in zip(together, frozen(images[i : i + 1]), strict=True):
-            assert torch.equal(whole[i : i + 1], alone), i
-        alone = pipe(images[i : i + 1])
-        assert float((batch.depth_mm[i] - alone.depth_mm[0]).abs().max()) < 1e-3  # a shadow's slopes may fit alike
-        assert float((batch.contact[i] ^ alone.contact[0]).double().mean()) < 1e-3
-    assert bool(batch.deformed[1:].flatten(1).any(dim=1).all())
-
-
 @pytest.mark.parametrize("mode", ["fast", "precise"])
 def test_recording_gradients_changes_no_frame_of_a_batch(mode: str) -> None:
     pipe, images = vts.DepthPipeline.from_calibration(unit_of("response"), mode), dissimilar()[:3]
@@ -210,15 +194,6 @@ def test_recording_gradients_changes_no_frame_of_a_batch(mode: str) -> None:
     assert recorded.grad is not None
     assert bool(recorded.grad[1].any())
     assert not bool(recorded.grad[[0, 2]].any())
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("mode", ["fast", "precise"])
-def test_a_scripted_batch_is_its_frames(mode: str) -> None:
-    images = dissimilar()[4:]
-    pipe = torch.jit.script(vts.DepthPipeline.from_calibration(unit_of("lights"), mode))
-    batch = pipe(images).depth_mm
-    assert all(torch.equal(batch[i : i + 1], pipe(images[i : i + 1]).depth_mm) for i in range(len(images)))
 
 
 @pytest.mark.parametrize("size", [(8, 640), (640, 8), (8, 5000)])
@@ -344,11 +319,3 @@ def test_the_way_that_asks_for_nothing_gives_the_same_depth(kind: str, mode: str
     found = pipe(images)
     assert torch.equal(found.deformed, expected.deformed)
     assert float((found.depth_mm - expected.depth_mm).abs().max()) < 1e-5
-
-
-def test_normals_of_another_pitch_are_refused() -> None:
-    lights = rig().lights
-    assert lights is not None
-    other = vts.NormalFromIntensity(lights, HEIGHT, WIDTH, 2 * PITCH)
-    with pytest.raises(ValueError, match=r"normals: expected a pitch of 0\.25 mm per pixel, got NormalFromIntensity with 0\.5"):
-        vts.DepthPipeline.from_calibration(rig(), normals=other)

@@ -118,6 +118,20 @@ def test_a_background_with_a_contact_is_doubted(given, count):
     )
 
 
+def test_the_edge_of_a_channel_that_a_camera_cuts_off_is_no_contact(given):
+    """It moves with the exposure; a press that lies where the channel is lit is seen all the same."""
+    background, presses = given
+
+    def cut(image, level):
+        ramp = torch.linspace(0.15, 1.5, image.shape[2])
+        return torch.stack((image[0], image[1], (image[2] * ramp - level * image[2].mean()).clamp(0.0, 1.0)))
+
+    others = changed(presses[4:8], lambda image: cut(image, 0.5))
+    assert beside_presses(cut(background, 0.4), others) == ""
+    right = max(presses, key=lambda press: press.center_px[0])
+    assert beside_presses(cut(right.image, 0.4), others) != ""
+
+
 def test_a_press_that_is_no_press_and_a_spot_on_the_lens_are_no_contact_in_the_background(given):
     background, presses = given
     noisy = background + 0.004 * torch.randn(background.shape, generator=torch.Generator().manual_seed(0))

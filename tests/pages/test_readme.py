@@ -1,4 +1,4 @@
-"""README's code and commands run as they stand, on images of a real sensor where these are, else on rendered ones."""
+"""README's code and commands run as they stand, on images of a real sensor where these are, else on drawn ones."""
 
 import os
 import shutil
@@ -9,18 +9,34 @@ import torch
 from documents import ROOT, run
 
 import torchvts as vts
+from torchvts.model.response_field import CHANGE_SCALE
 
 README = ROOT / "README.md"
 
 
-def photograph(folder, ring):
-    """Render what README asks for: without contact, a ball of 6.31 mm, and a press by another ball."""
-    lights = ring(radius_mm=16.0, height_mm=20.0)
+def mini_image(scene, seed):
+    """The image of a GelSight Mini by its prior: the light in which its response sees the slopes of a scene, by Newton steps."""
+    sensor = vts.Sensor.load("gelsight_mini")
+    size, response = (sensor.height, sensor.width, sensor.mm_per_pixel), sensor.prior.response
+    normals = vts.NormalFromResponse(response.field, None, *size)
+    inverse = CHANGE_SCALE * torch.linalg.pinv(response.field.maps(*size)[:3].float().permute(2, 3, 1, 0))  # (H, W, 3, 2)
+    light = torch.ones(1, 3, *size[:2])
+    for _ in range(20):
+        off = normals(light)[:, :2] - scene.normal[:, :2]
+        light = light + 0.5 * torch.einsum("hwck,bkhw->bchw", inverse, off)
+    assert float(off.abs().max()) < 1e-3
+    image = sensor.prior.background(*size).float().clamp(0, 1) * light[0] ** (1.0 / response.gamma)
+    return image + 0.003 * torch.randn(image.shape, generator=torch.Generator().manual_seed(seed))
+
+
+def photograph(folder):
+    """Draw what README asks for: a Mini without contact, with a ball of 6.31 mm, and a press by another ball."""
     ball, other = (
         vts.scenes.sphere_press(r, d, c, 240, 320, 0.0634) for r, d, c in ((3.155, 0.4, (-2.0, 1.0)), (4.75, 0.5, (2.0, 1.0)))
     )
-    for name, scene in (("background", vts.scenes.undeformed(ball)), ("ball", ball), ("press", other)):
-        vts.write_image(folder / f"{name}.png", vts.scenes.render(scene, lights, noise_std=0.003, bits=8)[0].detach())
+    scenes = {"background": vts.scenes.undeformed(ball), "ball": ball, "press": other}
+    for seed, (name, scene) in enumerate(scenes.items()):
+        vts.write_image(folder / f"{name}.png", mini_image(scene, seed).clamp(0, 1))
     return other
 
 
@@ -37,9 +53,9 @@ def real_images(folder):
 
 @pytest.mark.filterwarnings("ignore::torchvts.CalibrationWarning")
 @pytest.mark.parametrize("rendered", [False, pytest.param(True, marks=pytest.mark.long)])
-def test_code_and_commands_run_in_order(rendered, tmp_path, monkeypatch, ring):
+def test_code_and_commands_run_in_order(rendered, tmp_path, monkeypatch):
     real = not rendered and real_images(tmp_path)
-    truth = None if real else photograph(tmp_path, ring)
+    truth = None if real else photograph(tmp_path)
     monkeypatch.chdir(tmp_path)
     names = run(README)
     deepest_mm = float(vts.read_result("out/press/press.npz").depth_mm.max())

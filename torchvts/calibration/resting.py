@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from ..core.blur import band_of_ratios, blur, gaussian_weights
-from ..core.levels import SATURATED
+from ..core.levels import BLACK, SATURATED
 from ..core.morphology import dilate
 from ..core.robust import TUKEY, tukey_weight
 from ..model.calibration import PEDESTAL, Calibration
@@ -36,7 +36,7 @@ LEAST_MM = 0.1
 def beside_presses(background: Tensor, presses: Sequence[Press]) -> str:
     """Why a background holds a contact: structure between the channels, somewhere, that the presses lack there; or "".
 
-    What is saturated in one of them is left out, as its edge moves with the exposure.
+    What is saturated or black in one of them is left out, as its edge moves with the exposure.
 
     Args:
         background: (3, H, W) in [0, 1].
@@ -127,7 +127,8 @@ def _structure(image: Tensor) -> Tensor:
 
 
 def _clipped(image: Tensor) -> Tensor:
-    """Cells of :func:`_structure` that saturated pixels reach, bool (h, w)."""
-    cell = _cell(image)
-    full = torch.nn.functional.max_pool2d((image.detach().cpu() > SATURATED).any(dim=0).float()[None, None], cell)
-    return _inner(dilate(full > 0, round(min(full.shape[2:]) / 8.0))[0, 0])
+    """Cells of :func:`_structure` that saturated pixels reach, or cells that are mostly black in a channel, bool (h, w)."""
+    cell, image = _cell(image), image.detach().cpu()
+    full = torch.nn.functional.max_pool2d((image > SATURATED).any(dim=0).float()[None, None], cell) > 0
+    black = torch.nn.functional.avg_pool2d((image <= BLACK).float()[None], cell).amax(dim=1, keepdim=True) > 0.5
+    return _inner(dilate(full | black, round(min(full.shape[2:]) / 8.0))[0, 0])

@@ -225,7 +225,7 @@ def check_steady(images: Tensor, codec: str = "") -> None:
             "contacts; record without loss (--record raw.mkv, or PNG), or use the background of a calibration (--calibration with "
             "--background-frames 0; background_frames=0)"
         )
-    raise ValueError(f"{where}: a contact, or the sensor moves; start without contact, or take fewer frames")
+    raise ValueError(f"{where}: a contact, or the sensor moves; start without contact, or take fewer (--background-frames N)")
 
 
 def with_background(calibration: Calibration, background: Tensor) -> Calibration:

@@ -9,10 +9,12 @@ import torch
 
 import torchvts as vts
 from lab.drawn_sensors import drawn_sensor
+from torchvts.calibration import CalibrationWarning
 from torchvts.calibration.contacts import used
 from torchvts.calibration.doubts import of_sizes, width_of
 from torchvts.calibration.press_model import by_presses
 from torchvts.calibration.resting import beside_presses
+from torchvts.scenes import objects
 from torchvts.stream.background import with_background
 
 UNIT = drawn_sensor(0)
@@ -33,6 +35,15 @@ def test_the_width_of_contacts_knows_nothing_of_the_given_diameter(times, expect
     unit, contacts = by_presses(UNIT.background, UNIT.sensor, bare(UNIT.balls[:6], times), None)
     wide, std = width_of(unit.response.field, used(contacts), UNIT.sensor.mm_per_pixel)
     assert wide == pytest.approx(expected, abs=0.1) and 0.05 <= std < 0.15
+
+
+@pytest.mark.parametrize("height_mm, diameter_mm", [(objects.bottle_cap(), 12.0), (objects.stamp(), 6.0)], ids=["cap", "stamp"])
+def test_what_is_no_ball_is_not_metric(height_mm, diameter_mm):
+    """Alone it contradicts no other press, but the error to expect is larger than its slopes."""
+    press = UNIT.press(height_mm, objects.pose(press_mm=0.3), seed=5)
+    with pytest.warns(CalibrationWarning, match="they tell nothing of slopes: were they of a ball"):
+        unit = vts.calibrate(UNIT.background, UNIT.sensor, [vts.Press(press.image, diameter_mm)])
+    assert not unit.metric and vts.calibrate(UNIT.background, UNIT.sensor, bare(UNIT.balls[:1])).metric
 
 
 def test_saturated_light_whose_edge_moves_is_no_contact_in_the_background():

@@ -68,6 +68,10 @@ def test_what_nothing_could_check_is_said_and_no_warning():
         and said.startswith("not checked: the scale rests on the diameters and the mm_per_pixel that were given")
     )
     assert float(re.search(r"up to ([\d.]+) would fit the contacts", said)[1]) > 1.2 * drawn().sensor.mm_per_pixel
+    pipe = vts.DepthPipeline.from_calibration(unit)
+    depths = [float(pipe(press.image[None]).depth_mm.max()) for press in smaller]
+    said_mm = map(float, re.search(r"by which the presses are ([\d.]+) to ([\d.]+) mm deep: is that so", said).groups())
+    assert list(said_mm) == pytest.approx([min(depths), max(depths)], rel=0.1)
 
 
 @pytest.mark.parametrize("pitch_off", [0.9, pytest.param(1.1, marks=pytest.mark.long)])

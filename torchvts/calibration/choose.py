@@ -13,7 +13,7 @@ from ..model.sensor import Sensor
 from . import resting
 from .by_lights import by_lights
 from .contacts import Contact, NoUsablePress, used
-from .doubts import SURE, Doubt, not_checked, of_fitted_lights, of_presses, of_sizes, of_type, too_wide, width_of
+from .doubts import SURE, Doubt, not_checked, of_error, of_fitted_lights, of_presses, of_sizes, of_type, too_wide, width_of
 from .field import Family
 from .given_images import colourless
 from .posterior import Evidence, prior_of, weights_of
@@ -121,13 +121,14 @@ def _from_presses(given: Given) -> Made:
     width = width_of(field, used(contacts), pitch_mm)
     if width.times > 1.0 + SURE * width.std and not given.force:
         raise ValueError(f"{too_wide(width, pitch_mm)}; force=True (--force) goes on all the same")
-    doubts = [*made.doubts, *of_presses(contacts, field, pitch_mm, width)]
+    doubts = [*made.doubts, *of_presses(contacts, field, pitch_mm, width), *of_error(unit.report["stated_deg"], contacts)]
     if contact:
         doubts.insert(0, Doubt(contact, True))
+    unit, depth_mm = with_contact(unit, given.presses, contacts)
     if not any(doubt.of_scale for doubt in doubts):
         sensor = given.sensor if "prior_deg" in unit.report else given.sensor.without_prior()
-        doubts.append(not_checked(contacts, sensor, width))
-    return made._replace(unit=with_contact(unit, given.presses, contacts), doubts=doubts)
+        doubts.append(not_checked(contacts, sensor, width, depth_mm))
+    return made._replace(unit=unit, doubts=doubts)
 
 
 def _fitted(given: Given, strange: list[Doubt]) -> tuple[Made, list[Contact]]:

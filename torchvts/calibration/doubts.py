@@ -207,27 +207,50 @@ def too_wide(width: Width, pitch_mm: float) -> str:
     )
 
 
-def not_checked(contacts: Sequence[Contact], sensor: Sensor, width: Width) -> Doubt:
+def of_error(stated_deg: float, contacts: Sequence[Contact]) -> list[Doubt]:
+    """An error that is larger than the slopes that it is of: undeformed skin would be as good an answer.
+
+    Args:
+        stated_deg: to expect over the skin, degrees.
+        contacts: of all presses.
+    """
+    steep = [min(1.0, contact.contact_radius_mm / contact.radius_mm) for contact in used(contacts)]
+    slope_deg = math.degrees(2.0 / 3.0 * math.asin(statistics.median(steep)))  # about the mean over a disc
+    if stated_deg < slope_deg:
+        return []
+    return [
+        Doubt(
+            f"presses: normals are expected to be off by {stated_deg:.0f} degrees, and those of the presses are only "
+            f"{slope_deg:.0f} from the skin's: they tell nothing of slopes: were they of a ball, one contact each?",
+            True,
+        )
+    ]
+
+
+def not_checked(contacts: Sequence[Contact], sensor: Sensor, width: Width, depth_mm: Sequence[float]) -> Doubt:
     """What the images cannot show of sizes and pitch.
 
     Args:
         contacts: of all presses.
         sensor: with the prior that they were fitted from, if any.
         width: of the contacts, see :func:`width_of`.
+        depth_mm: of presses, by the calibration; who pressed knows about how deep they were.
     """
+    deep = f", by which the presses are {min(depth_mm):.2g} to {max(depth_mm):.2g} mm deep" if depth_mm else ""
     if sensor.prior is not None:
         return Doubt(
             f"{NOT_CHECKED}: the sensor's prior shows a wrong diameter or mm_per_pixel only beyond a factor of "
-            f"{math.exp(SURE * _std_by_prior(len(used(contacts)))):.1f}: scale rests on what was given; an object of known height "
-            "would check it"
+            f"{math.exp(SURE * _std_by_prior(len(used(contacts)))):.1f}: scale rests on what was given{deep}; an object of "
+            "known height would check it"
         )
     most = f"{sensor.mm_per_pixel / width.times:.3g}" if width.times else ""
     limit = f" (an mm_per_pixel up to {most} would fit the contacts)" if most else ""
+    seen = f"{deep}: is that so? Without" if deep else ": without"
     alone = [contact.name for contact in used(contacts) if SURE * contact.metrics.get("gain_std", math.inf) > WRONG_BALL]
     named = ", ".join(alone[:3]) + (f" and {len(alone) - 3} more" if len(alone) > 3 else "")
     return Doubt(
-        f"{NOT_CHECKED}: the scale rests on the diameters and the mm_per_pixel that were given{limit}: without a prior no image "
-        "shows whether they are right; press an object of known height to check them"
+        f"{NOT_CHECKED}: the scale rests on the diameters and the mm_per_pixel that were given{seen} a prior no "
+        f"image shows whether they are right{limit}; press an object of known height to check them"
         + (f"; a diameter wrong by half would not show in {named}: press the same ball beside it" if alone else "")
     )
 

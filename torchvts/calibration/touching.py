@@ -29,8 +29,11 @@ MOST_PRESSES = 8
 """Presses that are looked at, evenly chosen."""
 
 
-def with_contact(calibration: Calibration, presses: Sequence[Press], contacts: Sequence[Contact]) -> Calibration:
-    """The calibration with L of contact, the median over located balls, and the share that gives their circles best.
+def with_contact(
+    calibration: Calibration, presses: Sequence[Press], contacts: Sequence[Contact]
+) -> tuple[Calibration, list[float]]:
+    """The calibration with L of contact, the median over located balls, and the share that gives their circles best; and how deep
+    these balls are pressed in by it, mm.
 
     Unchanged where none was located.
 
@@ -43,14 +46,15 @@ def with_contact(calibration: Calibration, presses: Sequence[Press], contacts: S
     some = located[:: max(1, math.ceil(len(located) / MOST_PRESSES))]
     seen = [_depth_and_circle(calibration, press, contact) for press, contact in some]
     if not seen:
-        return calibration
+        return calibration, []
     pitch_mm = calibration.sensor.mm_per_pixel
     decay_mm = float(torch.cat([ContactFromDepth(pitch_mm).decays_mm(depth) for depth, _, _ in seen]).median())
     decay_mm = decay_mm if decay_mm > BLUR_MM else 0.0  # a rim that is only blurred
     overlap = {share: _overlap(ContactFromDepth(pitch_mm, share, decay_mm), seen) for share in SHARES}
     as_good = [share for share in SHARES if overlap[share] > max(overlap.values()) - TIE]
     share = min(as_good, key=lambda share: abs(share - SHARE))
-    return dataclasses.replace(calibration, contact_share=share, contact_decay_mm=decay_mm)
+    unit = dataclasses.replace(calibration, contact_share=share, contact_decay_mm=decay_mm)
+    return unit, [float(depth[circle].max()) for depth, _, circle in seen]
 
 
 def depth_of(calibration: Calibration, image: Tensor) -> tuple[Tensor, Tensor]:

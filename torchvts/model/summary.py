@@ -67,7 +67,8 @@ def where_next(calibration: Calibration) -> str:
     place, _ = found
     sensor = calibration.sensor
     x, y = ((n - 0.5 * (size - 1)) * sensor.mm_per_pixel for n, size in zip(place, (sensor.width, sensor.height), strict=True))
-    return f"around x {place[0]}, y {place[1]} px of rectified images ({x:+.1f}, {y:+.1f} mm from the middle), which is known least"
+    beside = f"{abs(x):.1f} mm {'right' if x > 0 else 'left'} of the middle, {abs(y):.1f} mm {'below' if y > 0 else 'above'} it"
+    return f"around x {place[0]}, y {place[1]} px of rectified images ({beside}), which is known least"
 
 
 def doubts_of(report: Report) -> list[str]:

@@ -116,7 +116,7 @@ def _from_presses(given: Given) -> Made:
     assert unit.response is not None
     if strange and "prior_deg" in unit.report:  # whatever presses seem to be by the prior of another view follows from that
         doubts = [Doubt(contact, True)] * bool(contact) + strange
-        return made._replace(unit=with_contact(unit, given.presses, contacts), doubts=doubts)
+        return made._replace(unit=with_contact(unit, given.presses, contacts)[0], doubts=doubts)
     field, pitch_mm = unit.response.field, given.sensor.mm_per_pixel
     width = width_of(field, used(contacts), pitch_mm)
     if width.times > 1.0 + SURE * width.std and not given.force:

@@ -214,8 +214,8 @@ def check_steady(images: Tensor) -> None:
     raise ValueError(
         f"background: frame {int(moved.argmax())} of the first {len(images)} differs from the others in {int(moved.max())} of "
         f"{difference[0, 0].numel()} places, by at most {most:.1f} of 255: a contact, or the sensor moves: start without contact, "
-        "or take fewer (--background-frames N); up to 4 of 255 may be blocks of a lossy video, which hide faint contacts: record without loss "
-        "(--record raw.mkv, or PNG), or use a calibration's background (--background-frames 0; background_frames=0)"
+        "or take fewer (--background-frames N); up to 4 of 255 may be blocks of a lossy video, which hide faint contacts: record "
+        "without loss (--record raw.mkv, or PNG), or use a calibration's background (--background-frames 0; background_frames=0)"
     )
 
 

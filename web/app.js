@@ -1,15 +1,21 @@
 // The page: a plan and a camera, images or a video, to depth in 3D, its profile, and millimetres under the cursor.
 
-import { ROUGH, Resting, doubtOf, structure } from "./background.js";
+import { Resting, doubtOf, touchOf } from "./background.js";
 import { COLOURS } from "./colour.js";
+import { doubtsOf } from "./conditions.js";
+import { ballOf, median } from "./fit.js";
 import { Rectify, cameras, openCamera } from "./frames.js";
-import { fileOf } from "./save.js";
+import { fileOf, pressesOf } from "./save.js";
 import { Surface } from "./surface.js";
 import { Plan, library } from "./torchvts.js";
 
 const $ = (id) => document.getElementById(id);
-// known: whether the plan has the background of this unit; planes: the image that is shown, (3, height, width); film: the video or camera that plays
-export const state = { c: null, plan: null, known: true, plans: [], planes: null, images: [], at: 0, found: null, cross: null, film: null, frozen: false, surface: null };
+// known: whether the plan has the background of this unit; doubt: of that background; missized: whether balls are not as large as they should be;
+// planes: the image that is shown, (3, height, width); film: the video or camera that plays; given: the files that were opened last; kept: presses
+export const state = {
+  c: null, plan: null, drawn: true, known: true, doubt: "", missized: false, asked: false, plans: [], planes: null, given: [], images: [], at: 0, found: null, cross: null,
+  film: null, frozen: false, surface: null, background: null, filmed: false, kept: [], saved: true,
+};
 
 function say(text, bad = false) {
   $("status").textContent = text;
@@ -25,22 +31,28 @@ const told = (work) => async (...given) => {
   }
 };
 
-const unit = () => (state.plan.metric ? "mm" : "(NOT mm: the scale of this unit is not known)");
+/** The unit of lengths; what is not known of it is said at each number. */
+const unit = () => (!state.plan.metric ? "NOT mm" : state.doubt || state.missized ? "mm, in doubt" : "mm");
 
 // ---- measuring ----
 
+const reader = new OffscreenCanvas(1, 1), context = reader.getContext("2d", { willReadFrequently: true });
+
 function pixelsOf(source, width, height) {
-  const canvas = new OffscreenCanvas(width, height);
-  const context = canvas.getContext("2d", { willReadFrequently: true });
+  if (reader.width !== width || reader.height !== height) Object.assign(reader, { width, height });
+  context.clearRect(0, 0, width, height);
   context.drawImage(source, 0, 0);
   return context.getImageData(0, 0, width, height);
 }
 
 /** Takes a frame as its source gives it: the image in it, and its depth where the background is known. */
 function see(source, width, height, name) {
-  state.raw = `${width} x ${height}`;
+  const { plan } = state;
   state.planes = state.rectify.image(pixelsOf(source, width, height), name);
+  const start = performance.now(), cut = width === plan.width && height === plan.height ? "" : ` of ${width} x ${height}`;
   measure();
+  const time = state.film && state.known ? `, measured and shown in ${(performance.now() - start).toFixed(1)} ms` : ""; // the first of all images takes longer
+  $("rate").textContent = `${plan.width} x ${plan.height}${cut}${time}`;
 }
 
 function measure() {
@@ -52,32 +64,65 @@ function measure() {
   }
   if (!state.known) {
     drawMap("image", pixels);
-    $("take").disabled = Boolean(state.film?.resting);
+    $("what").textContent = "no depth without a background", $("take").disabled = false;
     return;
   }
-  const start = performance.now();
-  const found = plan.measure(planes);
-  state.found = { ...found, pixels, ms: performance.now() - start };
+  state.found = { ...plan.measure(planes), pixels };
   $("save").disabled = $("download").disabled = $("take").disabled = false;
+  $("keep").disabled = !state.background;
   show();
 }
 
 // ---- the background ----
 
+/** Asks once more before a background is taken that may be none: sensors differ, and a doubt is no proof. */
+function ask(again) {
+  state.asked = again;
+  $("take").textContent = again ? "Take it all the same" : "Take background";
+}
+
 /** The shown image, or the last frames of the camera, become the image without contact. */
 function takeBackground() {
   const { plan, film } = state, image = film?.resting ? film.resting.image() : state.planes;
-  if (!film?.resting && structure(image, plan.height, plan.width) > ROUGH) {
-    throw new Error("Something touches the skin in this image: show one without contact, then take it.");
-  }
+  const why = state.asked ? "" : film?.resting ? film.resting.why(plan) : touchOf(image, plan);
+  ask(Boolean(why));
+  if (why) throw new Error(`${why} Then take it; or take it all the same, if that is not so.`);
   const made = plan.withBackground(image), doubt = doubtOf(image, plan, state.known);
   plan.free();
-  Object.assign(state, { plan: made, known: true, rectify: new Rectify(made), background: image, found: null });
+  Object.assign(state, { plan: made, known: true, rectify: new Rectify(made), background: image, filmed: Boolean(film?.resting), found: null, doubt });
   measure();
   $("still").textContent = "";
-  const check = film?.resting ? " Browsers may change a camera's colours: press one ball of known size before you trust the millimetres." : "";
+  const check = film?.resting ? " Browsers may change a camera's colours: keep presses of a ball of known size before you trust the millimetres." : "";
   say(doubt ? `The background is taken, and in doubt: ${doubt}` : `The background is taken. Press something into the skin.${check}`, Boolean(doubt));
 }
+
+// ---- presses of a ball ----
+
+/** The shown image is kept as a press of a ball; says the size that its depth has. */
+function keepPress() {
+  const { plan, found, kept } = state, ball = $("ball").valueAsNumber;
+  if (!(ball > 0)) throw new Error("How large is the ball? Give its diameter in mm, then keep the press.");
+  if (plan.about.view?.place) throw new Error("This sensor's calibration needs whole frames: torchvts calibrate --camera keeps them.");
+  const read = ballOf(found, plan);
+  if (!read) throw new Error("Nothing touches the skin here: press the ball, hold it (Freeze helps), then keep it.");
+  kept.push({ image: state.planes, ball, share: read / ball }), (state.saved = false);
+  $("zip").disabled = false, $("zip").textContent = `Save ${kept.length} press${kept.length > 1 ? "es" : ""}`;
+  const off = median(kept.map(({ share }) => share)) - 1, all = kept.length > 1 ? `, the median of ${kept.length} ${sizeOf(off)}` : "";
+  state.missized = Math.abs(off) > Math.max(0.15, 0.25 / Math.sqrt(kept.length)); // docs/web.md: how far presses are off
+  const doubt = state.missized ? " Then depth is NOT in mm: is the diameter right, or does the browser change the camera's colours? A calibration from these presses mends that for this page." : "";
+  say(`Kept: its depth is that of a ball of ${read.toFixed(1)} mm: ${sizeOf(read / ball - 1)}${all}.${doubt} Press elsewhere; eight to twelve make a calibration.`, state.missized);
+  show();
+}
+
+const sizeOf = (off) => `${Math.abs(Math.round(100 * off))} % too ${off < 0 ? "small" : "large"}`;
+
+async function savePresses() {
+  download(await pressesOf(state.background, state.kept, state.plan), "presses.zip");
+  state.saved = true;
+  say(`Unpack presses.zip, then: torchvts calibrate presses --sensor ${state.plan.about.unit} --out unit.safetensors; torchvts view --web unit.safetensors shows it here.${elsewhere()}`);
+}
+
+const elsewhere = () => (state.filmed ? " Its colours are those that this browser makes of the camera: for Python, C and robots calibrate by torchvts calibrate --camera." : "");
 
 // ---- showing ----
 
@@ -89,21 +134,29 @@ function show() {
     if (mm > most) most = mm, deepest = k;
     touched += found.contact[k];
   });
-  found.most = most > 0 ? most : 0.01;
-  found.deepest = [deepest % width, Math.floor(deepest / width)];
+  found.most = [0.2, 0.3, 0.5, 0.7, 1, 1.5, 2, 3, 5, 10].find((end) => most <= end) ?? most; // of few steps, so that colours stay while one presses
+  found.deepest = most > 0 ? [deepest % width, Math.floor(deepest / width)] : [width >> 1, height >> 1];
   const picture = new ImageData(width, height);
   found.depth.forEach((mm, k) => {
     const at = 4 * Math.round(255 * Math.min(1, Math.max(0, mm / found.most)));
     picture.data.set(COLOURS.subarray(at, at + 4), 4 * k);
   });
   found.picture = picture;
-  $("most").textContent = `${found.most.toFixed(3)} ${plan.metric ? "mm" : "NOT mm"}`;
-  const area = touched * plan.pitch * plan.pitch;
-  $("what").textContent = `deepest ${most.toFixed(3)} ${unit()}, contact ${area.toFixed(1)} ${plan.metric ? "mm²" : ""}`;
-  const cut = state.raw === `${width} x ${height}` ? "" : ` of ${state.raw}`;
-  $("rate").textContent = `${width} x ${height}${cut}, measured in ${found.ms.toFixed(1)} ms`;
+  outline(found, width);
+  $("most").textContent = `${found.most} ${unit()}`;
+  const area = touched * plan.pitch * plan.pitch, { text, low } = doubtsOf(found.conditions);
+  $("doubt").textContent = text;
+  $("what").textContent = `deepest ${low ? "at least " : ""}${most.toFixed(3)} ${unit()}, contact ${area.toFixed(1)} mm²`;
   state.surface?.show(found.depth, height, width, plan.pitch, found.most);
   drawMaps();
+}
+
+/** Draws where something touches, in the image and in the depth. */
+function outline({ contact, pixels, picture }, width) {
+  contact.forEach((on, k) => {
+    if (!on || (contact[k - 1] && contact[k + 1] && contact[k - width] && contact[k + width])) return;
+    for (const { data } of [pixels, picture]) data.fill(255, 4 * k, 4 * k + 3);
+  });
 }
 
 function drawMap(id, data) {
@@ -128,8 +181,8 @@ function drawMaps() {
     context.fillRect(0, cross[1], plan.width, 1), context.fillRect(cross[0], 0, 1, plan.height);
   }
   const mm = found.depth[cross[1] * plan.width + cross[0]];
-  $("under").textContent = `${mm.toFixed(3)} ${plan.metric ? "mm" : "NOT mm"} at x ${cross[0]}, y ${cross[1]}`;
-  $("row").textContent = `along row ${cross[1]}, ${plan.metric ? "mm" : "NOT mm"}`;
+  $("under").textContent = `${mm.toFixed(3)} ${unit()} at x ${cross[0]}, y ${cross[1]}`;
+  $("row").textContent = `along row ${cross[1]}, ${unit()}`;
   drawProfile();
 }
 
@@ -147,7 +200,7 @@ function drawProfile() {
   context.textAlign = "right";
   for (const mm of [0, found.most / 2, found.most]) {
     context.beginPath(), context.moveTo(left, y(mm)), context.lineTo(w, y(mm)), context.stroke();
-    context.fillText(mm.toFixed(found.most < 0.1 ? 3 : 2), left - 6 * dense, y(mm) + 4 * dense);
+    context.fillText(mm.toFixed(2), left - 6 * dense, y(mm) + 4 * dense);
   }
   const across = plan.width * plan.pitch;
   for (const share of [0, 0.5, 1]) {
@@ -162,29 +215,38 @@ function drawProfile() {
 
 // ---- plans ----
 
-/** known: false for a prior, which knows the type of a sensor and not this unit's background. */
-function usePlan(bytes, known = true) {
-  const plan = new Plan(state.c, bytes);
+/** prior_deg: of a prior, which knows the type of a sensor and not this unit's background; else null. */
+function usePlan(bytes, prior_deg = null, drawn = false) {
+  if (!state.saved && !confirm("The presses that you kept are not saved. Go on without them?")) throw new Error("The presses are still here: save them first.");
+  const plan = new Plan(state.c, bytes), known = prior_deg === null;
   state.plan?.free();
-  Object.assign(state, { plan, known, rectify: new Rectify(plan), planes: null, background: null, found: null, cross: null, images: [], at: 0 });
-  for (const id of ["what", "under", "row", "rate", "name", "most"]) $(id).textContent = "";
+  Object.assign(state, { plan, drawn, known, doubt: "", missized: false, rectify: new Rectify(plan), planes: null, background: null, found: null, cross: null, images: [], kept: [], saved: true });
+  for (const id of ["what", "under", "row", "rate", "name", "most", "doubt"]) $(id).textContent = "";
   for (const id of ["image", "depth", "profile"]) $(id).width = $(id).width; // clears it
-  state.surface?.clear();
-  for (const id of ["back", "next", "save", "take", "download"]) $(id).disabled = true;
-  const scale = plan.metric ? "lengths in mm" : "the scale is NOT known";
+  state.surface?.clear(), ask(false), ($("zip").textContent = "Save presses");
+  for (const id of ["back", "next", "save", "take", "download", "keep", "zip"]) $(id).disabled = true;
+  const scale = !plan.metric ? "the scale is NOT known" : known ? "lengths in mm" : `mm by the prior of its type, normals ${prior_deg.toFixed(1)}° off in the mean`;
   $("scale").textContent = `${plan.about.unit || "a unit"}, ${plan.about.mode}, ${(plan.pitch * 1000).toFixed(0)} µm a pixel, ${scale}`;
 }
 
 const WITHOUT = "Lift everything off the skin and keep it still, then take the background. Start the camera, or drop an image without contact.";
+const CHOOSE = "Which sensor is it? Choose it first: what is shown is a drawn one.";
 
-/** A prior of the page, or a file of the user's. */
+/** A prior of the page, or a plan of the user's; the files that were opened last are shown by it. */
 async function chooseType() {
-  const { file, prior_deg, name } = state.plans[$("type").value] ?? {};
-  if (!file) return $("files").click();
+  const row = state.plans[$("type").value], { given } = state;
+  if (!row) return ($("type").selectedIndex = 0), $("files").click();
   stopFilm();
-  usePlan(await bytesOf(file), prior_deg === null);
-  if (state.known) return say(`${name}, is in use. Now start the camera, or open images or a video of this unit.`);
-  say(`Depth by the prior of the type: normals of a unit that it has not seen are ${prior_deg.toFixed(1)} degrees off in the mean. ${WITHOUT}`);
+  usePlan(row.bytes ?? (await bytesOf(row.file)), row.prior_deg);
+  if (given.length) return open(given);
+  if (state.known) return say(`${row.name}, is in use. Now start the camera, or open images or a video of this unit.`);
+  say(`Depth by the prior of the type: normals of a unit that it has not seen are ${row.prior_deg.toFixed(1)} degrees off in the mean. ${WITHOUT}`);
+}
+
+/** Adds a plan to those that can be chosen, and chooses it. */
+function offer(row, chosen = true) {
+  state.plans.push(row);
+  $("type").add(new Option(row.name, state.plans.length - 1, chosen, chosen), $("type").options.length - 1);
 }
 
 // ---- files ----
@@ -196,9 +258,10 @@ async function showImage(at) {
   const bitmap = await createImageBitmap(file).catch(() => {
     throw new Error(`${file.name}: no image that this browser reads: PNG, JPEG and WebP are.`);
   });
+  ask(false);
+  see(bitmap, bitmap.width, bitmap.height, file.name);
   $("name").textContent = images.length > 1 ? `${file.name} (${state.at + 1} of ${images.length})` : file.name;
   $("back").disabled = $("next").disabled = images.length < 2;
-  see(bitmap, bitmap.width, bitmap.height, file.name);
 }
 
 function stopFilm() {
@@ -230,7 +293,7 @@ async function play(film, name) {
     if (film.resting) watch(film, count++);
     const now = performance.now();
     rate = 0.9 * rate + 0.1 * (1000 / Math.max(1, now - last)), last = now;
-    if (state.known) $("rate").textContent += `, ${rate.toFixed(0)} frames a second`;
+    $("rate").textContent += `, ${rate.toFixed(0)} frames a second`;
   };
   const frame = told(() => {
     if (state.film !== film) return;
@@ -240,22 +303,26 @@ async function play(film, name) {
       stopFilm();
       throw error;
     }
-    video.requestVideoFrameCallback(frame);
+    next(frame);
   });
-  video.requestVideoFrameCallback(frame);
+  const next = video.requestVideoFrameCallback?.bind(video) ?? requestAnimationFrame; // Firefox has it since 2024
+  next(frame);
   await video.play();
 }
 
-/** Says whether the camera shows the skin at rest, every few frames. */
-function watch(film, count) {
-  film.resting.add(state.planes);
-  if (count % 6 === 0) film.why = film.resting.why(), $("still").textContent = film.why || `Still and untouched: take the background ${state.known ? "again, where depth at rest is not 0" : "now"}.`;
-  $("take").disabled = Boolean(film.why);
+/** Says whether the camera shows the skin at rest, every few frames until there is a background. */
+function watch({ resting }, count) {
+  resting.add(state.planes, state.plan);
+  if (count % 6 || (state.known && !state.asked)) return;
+  const why = resting.why(state.plan);
+  $("still").textContent = why || "Still and untouched: take the background now.";
+  if (!why) ask(false);
 }
 
 async function startCamera() {
   if (state.film?.stream) return stopFilm();
-  stopFilm(), say("Allow the camera where the browser asks.");
+  if (state.drawn) throw new Error(CHOOSE);
+  stopFilm(), (state.given = []), say("Allow the camera where the browser asks.");
   const { plan } = state, stream = await openCamera($("camera").value, plan), track = stream.getVideoTracks()[0];
   const video = document.createElement("video");
   video.srcObject = stream;
@@ -263,7 +330,7 @@ async function startCamera() {
   $("start").textContent = "Stop";
   await listCameras(track.getSettings().deviceId);
   say(state.known ? "" : WITHOUT);
-  await play({ video, stream, resting: new Resting(plan.height, plan.width) }, track.label || "camera");
+  await play({ video, stream, resting: new Resting() }, track.label || "camera");
 }
 
 async function listCameras(chosen) {
@@ -275,21 +342,29 @@ function freeze(frozen) {
   $("freeze").textContent = frozen ? "Go on" : "Freeze";
 }
 
+function showSensor(shown) {
+  $("sensor").hidden = !shown, $("mine").setAttribute("aria-expanded", String(shown));
+}
+
 const open = told(async (files) => {
-  const plan = files.find((file) => file.name.endsWith(".plan"));
-  const video = files.find((file) => file.type.startsWith("video/"));
-  const images = files.filter((file) => file.type.startsWith("image/"));
+  const plan = files.find((file) => file.name.endsWith(".plan")), rest = files.filter((file) => file !== plan);
+  const video = rest.find((file) => file.type.startsWith("video/"));
+  const images = rest.filter((file) => file.type.startsWith("image/"));
+  if (files.some((file) => file.name.endsWith(".safetensors"))) throw new Error("The page takes a calibration by torchvts view --web unit.safetensors, or as the plan that pipe.freeze().save(\"unit.plan\") writes.");
   if (!plan && !video && !images.length) throw new Error("Expected a plan (.plan), images or a video, got none of them.");
-  stopFilm();
   if (plan) {
-    usePlan(new Uint8Array(await plan.arrayBuffer()));
-    $("type").value = "";
+    const bytes = new Uint8Array(await plan.arrayBuffer());
+    usePlan(bytes), stopFilm(), offer({ name: plan.name, bytes, prior_deg: null });
     say(`${plan.name} is in use. Now start the camera, or open images or a video of this unit.`);
   }
-  if (video) return say(state.known ? "" : WITHOUT), play({ video: Object.assign(document.createElement("video"), { src: URL.createObjectURL(video) }) }, video.name);
+  state.given = rest;
+  if (state.drawn) return showSensor(true), $("type").focus(), say(CHOOSE, true);
+  if (rest.length) stopFilm();
+  const without = state.known ? "" : "Take the background where nothing touches the skin: ";
+  if (video) return say(without && `${without}freeze the video there.`), play({ video: Object.assign(document.createElement("video"), { src: URL.createObjectURL(video) }) }, video.name);
   if (images.length) {
     state.images = images.sort((a, b) => a.name.localeCompare(b.name, undefined, { numeric: true }));
-    say(state.known ? "" : "Show an image without contact (the arrows go from one to the next), then take it as background.");
+    say(without && `${without}the arrows go from one image to the next.`);
     await showImage(0);
   }
 });
@@ -319,10 +394,12 @@ function moveCross(x, y) {
 
 function listen() {
   for (const id of ["image", "depth"]) {
+    $(id).addEventListener("pointerleave", (event) => {
+      if (event.pointerType === "mouse") state.cross = null, drawMaps(); // back to the deepest
+    });
     $(id).addEventListener("pointermove", (event) => {
-      const box = $(id).getBoundingClientRect();
-      const across = (event.clientX - box.left) / box.width, down = (event.clientY - box.top) / box.height;
-      moveCross(across * state.plan.width, down * state.plan.height);
+      const box = $(id).getBoundingClientRect(), { width, height } = state.plan, scale = Math.min(box.width / width, box.height / height);
+      moveCross((event.clientX - box.left - box.width / 2) / scale + width / 2, (event.clientY - box.top - box.height / 2) / scale + height / 2);
     });
   }
   $("depth").addEventListener("keydown", (event) => {
@@ -334,16 +411,16 @@ function listen() {
   $("back").addEventListener("click", told(() => showImage(state.at - 1)));
   $("next").addEventListener("click", told(() => showImage(state.at + 1)));
   $("save").addEventListener("click", told(saveDepth));
-  $("mine").addEventListener("click", () => {
-    $("sensor").hidden = !$("sensor").hidden;
-    $("mine").setAttribute("aria-expanded", String(!$("sensor").hidden));
-  });
+  $("mine").addEventListener("click", () => showSensor($("sensor").hidden));
   $("type").addEventListener("change", told(chooseType));
   $("start").addEventListener("click", told(async () => startCamera().catch((error) => (stopFilm(), Promise.reject(error)))));
   $("camera").addEventListener("change", told(async () => state.film?.stream && (stopFilm(), await startCamera())));
   $("take").addEventListener("click", told(takeBackground));
+  $("keep").addEventListener("click", told(keepPress));
+  $("zip").addEventListener("click", told(savePresses));
+  addEventListener("beforeunload", (event) => state.saved || event.preventDefault());
   $("freeze").addEventListener("click", () => freeze(!state.frozen));
-  $("download").addEventListener("click", () => download([state.plan.bytes()], "unit.plan"));
+  $("download").addEventListener("click", () => (download([state.plan.bytes()], "unit.plan"), say(`unit.plan is saved: drop it here another time.${elsewhere()}`)));
   document.addEventListener("keydown", (event) => {
     if (event.key === " " && event.target === document.body && state.film) freeze(!state.frozen), event.preventDefault();
   });
@@ -372,12 +449,11 @@ async function bytesOf(name) {
 told(async () => {
   state.c = await library(await bytesOf("torchvts.wasm"));
   $("bar").getContext("2d").putImageData(new ImageData(COLOURS.slice(), 256, 1), 0, 0);
-  usePlan(await bytesOf("demo.plan"));
-  state.plans = JSON.parse(new TextDecoder().decode(await bytesOf("plans.json")));
-  $("type").append(...state.plans.map(({ name }, k) => new Option(name, k)));
+  usePlan(await bytesOf("demo.plan"), null, true);
+  for (const row of JSON.parse(new TextDecoder().decode(await bytesOf("plans.json")))) offer(row, false);
   await listCameras();
   const demo = new File([await bytesOf("demo.png")], "a drawn press", { type: "image/png" });
-  say("A ball pressed into a drawn sensor. Plug in yours, or drop a plan of it (pipe.freeze().save(\"unit.plan\")) and its images here.");
+  say("A ball pressed into a drawn sensor. Turn it; millimetres are under the cursor. For a GelSight Mini or DIGIT of yours: Use my sensor, or drop its images.");
   try {
     state.surface = new Surface($("surface"));
   } catch (error) {

@@ -3,28 +3,30 @@
 import { COLOURS } from "./colour.js";
 
 const VERTEX = `#version 300 es
-uniform vec2 size; uniform float pitch, times, zoom, aspect; uniform vec2 turn;
-in float depth;
-out vec3 place; out float deep;
+precision highp sampler2D;
+uniform sampler2D depth; uniform float pitch, times, zoom, aspect; uniform vec2 turn;
+out vec3 normal; out float deep;
+float at(ivec2 pixel) { return texelFetch(depth, clamp(pixel, ivec2(0), textureSize(depth, 0) - 1), 0).r; }
 void main() {
-  vec2 grid = vec2(gl_VertexID % int(size.x), gl_VertexID / int(size.x));
-  vec2 flat_mm = (grid - 0.5 * (size - 1.0)) * pitch;
-  place = vec3(flat_mm.x, -flat_mm.y, depth * times); // as the camera sees it: the skin comes towards the eye
-  deep = depth;
+  ivec2 pixels = textureSize(depth, 0), pixel = ivec2(gl_VertexID % pixels.x, gl_VertexID / pixels.x), x = ivec2(1, 0), y = ivec2(0, 1);
+  vec2 size = vec2(pixels), flat_mm = (vec2(pixel) - 0.5 * (size - 1.0)) * pitch;
+  deep = at(pixel);
+  vec3 place = vec3(flat_mm.x, -flat_mm.y, deep * times); // as the camera sees it: the skin comes towards the eye
+  normal = vec3(at(pixel - x) - at(pixel + x), at(pixel + y) - at(pixel - y), 2.0 * pitch / times);
   float c = cos(turn.x), s = sin(turn.x), d = cos(turn.y), e = sin(turn.y);
   vec3 round = vec3(c * place.x - s * place.y, s * place.x + c * place.y, place.z);
-  vec3 seen = vec3(round.x, d * round.y + e * round.z, -e * round.y + d * round.z) * zoom / (size.x * pitch);
-  gl_Position = vec4(seen.x * min(1.0, 1.0 / aspect) * 1.7, seen.y * min(1.0, aspect) * 1.7, -0.3 * seen.z, 1.0);
+  vec3 seen = vec3(round.x, d * round.y + e * round.z, -e * round.y + d * round.z) * zoom / (max(size.x, 1.3 * size.y) * pitch);
+  float fit = 1.5 * min(1.0, 1.3 / aspect);
+  gl_Position = vec4(seen.x * fit, seen.y * fit * aspect, -0.3 * seen.z, 1.0);
 }`;
 
 const FRAGMENT = `#version 300 es
 precision highp float;
 uniform sampler2D colours; uniform float most;
-in vec3 place; in float deep;
+in vec3 normal; in float deep;
 out vec4 shown;
 void main() {
-  vec3 n = normalize(cross(dFdx(place), dFdy(place)));
-  float light = 0.35 + 0.65 * abs(dot(n, normalize(vec3(-0.5, 0.6, 0.8))));
+  float light = 0.5 + 0.5 * dot(normalize(normal), normalize(vec3(-0.5, 0.6, 0.8)));
   shown = vec4(texture(colours, vec2(clamp(deep / most, 0.0, 1.0), 0.5)).rgb * light, 1.0);
 }`;
 
@@ -55,11 +57,10 @@ export class Surface {
     gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA, 256, 1, 0, gl.RGBA, gl.UNSIGNED_BYTE, COLOURS);
     gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.LINEAR);
     gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_WRAP_S, gl.CLAMP_TO_EDGE);
-    gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
+    gl.activeTexture(gl.TEXTURE1), gl.bindTexture(gl.TEXTURE_2D, gl.createTexture());
+    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.NEAREST), gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.NEAREST);
+    gl.uniform1i(this.at("depth"), 1);
     gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
-    const depth = gl.getAttribLocation(program, "depth");
-    gl.enableVertexAttribArray(depth);
-    gl.vertexAttribPointer(depth, 1, gl.FLOAT, false, 0, 0);
     gl.enable(gl.DEPTH_TEST);
     this.listen();
     new ResizeObserver(() => this.draw()).observe(canvas);
@@ -108,7 +109,7 @@ export class Surface {
       gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, index, gl.STATIC_DRAW);
       this.count = index.length;
     }
-    gl.bufferData(gl.ARRAY_BUFFER, depth, gl.DYNAMIC_DRAW);
+    gl.texImage2D(gl.TEXTURE_2D, 0, gl.R32F, width, height, 0, gl.RED, gl.FLOAT, depth);
     Object.assign(this, { height, width, pitch, most });
     this.draw();
   }
@@ -125,7 +126,6 @@ export class Surface {
     canvas.width = canvas.clientWidth * dense, canvas.height = canvas.clientHeight * dense;
     gl.viewport(0, 0, canvas.width, canvas.height);
     gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
-    gl.uniform2f(this.at("size"), this.width, this.height);
     gl.uniform2f(this.at("turn"), ...this.turn);
     const numbers = { pitch: this.pitch, times: this.times, zoom: this.zoom, aspect: canvas.width / canvas.height, most: this.most };
     for (const [name, value] of Object.entries(numbers)) gl.uniform1f(this.at(name), value);

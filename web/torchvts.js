@@ -2,6 +2,8 @@
 
 const REASON = 256;
 const RGB8 = 0, FLOAT = 2;
+const CONDITIONS = 22;
+const KINDS = { f: Float32Array, d: Float64Array, i: BigInt64Array, b: Uint8Array };
 
 /** The compiled library; `bytes` of torchvts.wasm. */
 export async function library(bytes) {
@@ -34,9 +36,10 @@ export class Plan {
     this.image = this.take(12 * pixels);
     this.depth = this.take(4 * pixels);
     this.contact = this.take(pixels);
+    this.conditions = this.take(4 * CONDITIONS);
     this.output = this.take(24);
     // vts_output: depth, normal, contact, deformed, gradient, conditions; 0 for what is not wanted
-    new Uint32Array(library.memory.buffer, this.output, 6).set([this.depth, 0, this.contact, 0, 0, 0]);
+    new Uint32Array(library.memory.buffer, this.output, 6).set([this.depth, 0, this.contact, 0, 0, this.conditions]);
   }
 
   take(bytes) {
@@ -100,19 +103,28 @@ export class Plan {
     return new Uint8Array(this.c.memory.buffer, ...this.file).slice();
   }
 
-  /** A table of floats of the plan, by its name: docs/plan.md states how they lie. */
+  /** (3, height, width), linear light, which is value ** exponent. */
+  get background() {
+    return (this.light ??= this.table("background"));
+  }
+
+  get exponent() {
+    return (this.power ??= this.table("exponent")[0]);
+  }
+
+  /** A table of the plan, by its name: docs/plan.md states how they lie. */
   table(name) {
     const bytes = this.bytes(), view = new DataView(bytes.buffer), lines = (size) => Math.ceil(size / 64) * 64;
     for (let at = 64 + lines(view.getUint32(28, true)); at < bytes.length; ) {
       const found = new TextDecoder().decode(bytes.subarray(at, at + 32)).replace(/\0.*/, "");
-      const count = Number(view.getBigUint64(at + 40, true)), each = { f: 4, d: 8, i: 8, b: 1 }[String.fromCharCode(bytes[at + 32])];
-      if (found === name) return new Float32Array(bytes.buffer, at + 64, count);
-      at += 64 + lines(count * each);
+      const count = Number(view.getBigUint64(at + 40, true)), Values = KINDS[String.fromCharCode(bytes[at + 32])];
+      if (found === name) return new Values(bytes.buffer, at + 64, count).slice();
+      at += 64 + lines(count * Values.BYTES_PER_ELEMENT);
     }
     return null;
   }
 
-  /** Depth in mm and contact of an image: bytes R, G, B, A (height, width, 4), as a canvas gives it, or Float32Array (3, height, width) in [0, 1]. */
+  /** Depth in mm, contact and conditions of an image: bytes R, G, B, A (height, width, 4), as a canvas gives it, or Float32Array (3, height, width) in [0, 1]. */
   measure(image) {
     const pixels = this.height * this.width, format = this.put(image);
     const code = this.c.vts_depth(this.handle, this.image, format, this.output);
@@ -120,11 +132,12 @@ export class Plan {
     return {
       depth: new Float32Array(this.c.memory.buffer, this.depth, pixels).slice(),
       contact: new Uint8Array(this.c.memory.buffer, this.contact, pixels).slice(),
+      conditions: new Float32Array(this.c.memory.buffer, this.conditions, CONDITIONS).slice(),
     };
   }
 
   free() {
-    for (const at of [this.image, this.depth, this.contact, this.output]) this.c.free(at);
+    for (const at of [this.image, this.depth, this.contact, this.conditions, this.output]) this.c.free(at);
     this.c.vts_free(this.handle);
   }
 }

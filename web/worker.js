@@ -1,6 +1,6 @@
 // Keeps the page's files, so that it opens without a network: the newest that the server gave, else those of the last time.
 
-const FILES = ["./", "app.js", "background.js", "colour.js", "frames.js", "save.js", "surface.js", "torchvts.js", "style.css"];
+const FILES = ["./", "app.js", "background.js", "colour.js", "conditions.js", "fit.js", "frames.js", "save.js", "surface.js", "torchvts.js", "style.css"];
 const MORE = ["torchvts.wasm", "demo.plan", "demo.png", "plans.json"];
 
 addEventListener("install", (event) => {

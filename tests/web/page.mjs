@@ -59,31 +59,36 @@ async function picture(name, width, height, theme) {
 }
 const ready = () => until(`document.body?.dataset.ready === "yes"`);
 
-/** The drawn press, a plan with its images and a film, and what is refused. */
+const sensorType = () => evaluate(`[...document.getElementById("type").options].find((one) => one.text.startsWith("gelsight_mini")).value`);
+
+/** The drawn press, a plan with its images and a film, what is doubted, and what is refused. */
 async function files(seen) {
   Object.assign(seen, { demo: await depth(), under: await text("under"), drawn: await text("what") });
-  await press("depth", "ArrowRight");
-  seen.right = await text("under");
+  seen.ball = await evaluate(`Promise.all([import("./app.js"), import("./fit.js")]).then(([{ state }, { ballOf }]) => ballOf(state.found, state.plan))`);
   await picture("light", 1280, 680, "light"), await picture("dark", 1280, 680, "dark"), await picture("phone", 390, 1300, "dark");
   seen.wide = await evaluate("document.documentElement.scrollWidth");
+  await press("depth", "ArrowRight");
+  seen.right = await text("under"), seen.first = [];
+  await click("start"), seen.first.push(await text("status"));
+  await open("image.png"), seen.first.push(await text("status"), await depth());
   await open("unit.plan");
   seen.plan = await text("status"), seen.empty = await depth();
+  await open("swapped.png"), (seen.doubt = [await text("doubt"), await text("what")]);
   await open("image.png");
-  seen.unit = await depth(), seen.about = await text("scale");
+  seen.sure = await text("doubt"), seen.unit = await depth(), seen.about = await text("scale");
   await picture("unit", 1280, 680, "light");
   seen.refused = [];
-  for (const name of ["light.png", "bad.plan", "none.txt", "none.png", "sound.webm"]) await open(name), seen.refused.push(await text("status"));
+  for (const name of ["light.png", "bad.plan", "none.txt", "none.png", "sound.webm", "unit.safetensors"]) await open(name), seen.refused.push(await text("status"));
   await open("film.webm"), await sleep(1500);
   seen.film = await text("rate"), seen.name = await text("name"), seen.said = await text("status"), seen.what = await text("what");
 }
 
 /** A sensor by the prior of its type: background, press, freeze, what is saved. */
 async function sensor(seen) {
-  await click("mine");
-  const type = await evaluate(`[...document.getElementById("type").options].find((one) => one.text.startsWith("gelsight_mini")).value`);
-  await choose("type", type);
-  await until(`document.getElementById("status").textContent.includes("by the prior")`);
-  seen.prior = await text("status");
+  if (await evaluate(`document.getElementById("sensor").hidden`)) await click("mine");
+  await choose("type", await sensorType());
+  await until(`document.getElementById("scale").textContent.includes("by the prior")`);
+  seen.prior = await text("scale");
   await send("Browser.setPermission", { permission: { name: "camera" }, setting: "denied" });
   await click("start"), await until(`document.getElementById("status").textContent.includes("refused")`);
   seen.denied = await text("status");
@@ -97,8 +102,8 @@ async function sensor(seen) {
   await until(`document.getElementById("still").textContent.startsWith("Still") && !document.getElementById("take").disabled`);
   seen.still = await text("still"), seen.cameras = await evaluate(`document.getElementById("camera").textContent`);
   await picture("waiting", 1280, 760, "light");
-  await until(`document.getElementById("still").textContent.startsWith("Still") && !document.getElementById("take").disabled`);
-  await click("take");
+  const taken = `(document.getElementById("take").click(), document.getElementById("status").textContent.startsWith("The background is taken"))`;
+  await until(`document.getElementById("still").textContent.startsWith("Still") && document.getElementById("take").textContent === "Take background" && ${taken}`);
   await until(`Number(document.getElementById("what").textContent.split(" ")[1]) > 0.2 && !document.getElementById("freeze").click()`);
   Object.assign(seen, { taken: await text("status"), rate: await text("rate"), frozen: await text("freeze") });
   Object.assign(seen, { background: await array("background"), planes: await array("planes"), depth: await depth() });
@@ -107,16 +112,18 @@ async function sensor(seen) {
   await send("Browser.setDownloadBehavior", { behavior: "allow", downloadPath: `${folder}/saved` });
   for (const kind of ["npy", "png", "ply"]) await choose("kind", kind), await click("save"), await sleep(500);
   await click("download"), await sleep(1000);
+  await click("keep"), (seen.unsized = await text("status"));
+  await choose("ball", "6.31"), await click("keep"), await sleep(500), (seen.kept = await text("status"));
+  await click("zip"), await sleep(3000), (seen.zip = await text("status"));
   await click("start");
   seen.stopped = await text("start");
 }
 
 /** Images in place of a camera: the one that is shown becomes the background. */
 async function dropped(seen) {
-  const type = await evaluate(`[...document.getElementById("type").options].find((one) => one.text.startsWith("gelsight_mini")).value`);
-  await choose("type", type), await sleep(1000);
-  await open("image.png"), await click("take"), await sleep(500);
-  seen.contact = await text("status");
+  await choose("type", await sensorType()), await sleep(1000);
+  await open("corner.png"), await click("take"), await sleep(500);
+  seen.contact = [await text("status"), await text("take")];
   await open("a_rest.png", "b_press.png");
   seen.before = await depth();
   await click("take"), await sleep(500), await click("next"), await sleep(1000);
@@ -130,8 +137,9 @@ try {
   if (what === "walk") await ready(), await files(seen), await sensor(seen), await dropped(seen);
   if (what === "offline") await ready(), (seen.demo = await depth());
   if (what === "none") {
-    await ready(), await send("Browser.setPermission", { permission: { name: "camera" }, setting: "granted" }), await click("start");
-    await until(`!/Allow|ball/.test(document.getElementById("status").textContent)`);
+    await ready(), await send("Browser.setPermission", { permission: { name: "camera" }, setting: "granted" });
+    await choose("type", await sensorType()), await sleep(2000), await click("start");
+    await until(`document.getElementById("status").textContent.includes("No camera")`);
   }
   if (what === "plain") await until(`!document.getElementById("status").textContent.startsWith("Starting")`);
   if (what === "file") await sleep(2000);

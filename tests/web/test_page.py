@@ -7,6 +7,7 @@ import re
 import shutil
 import subprocess
 import threading
+import zipfile
 
 import cv2
 import numpy as np
@@ -60,8 +61,10 @@ def seen(site, data, tmp_path_factory):
     write_camera(folder / "camera.y4m", press, rest)
     write_image(folder / "a_rest.png", rest)
     write_image(folder / "b_press.png", press)
+    write_image(folder / "swapped.png", press.flip(0))
+    shutil.copy(data / "gelsight_mini_a" / "6.310mm" / "0" / "gelsight.png", folder / "corner.png")
     (folder / "bad.plan").write_bytes((folder / "unit.plan").read_bytes()[:100_000])
-    for name in ("none.txt", "none.png", "sound.webm"):
+    for name in ("none.txt", "none.png", "sound.webm", "unit.safetensors"):
         (folder / name).write_text("no image")
     server = make_server(site)
     threading.Thread(target=server.serve_forever, daemon=True).start()
@@ -118,6 +121,18 @@ def test_the_page_measures_a_drawn_press_at_once(seen):
     assert re.match(r"deepest 0\.9\d\d mm, contact [\d.]+ mm²", found["drawn"])
     x, y = map(int, re.search(r"mm at x (\d+), y (\d+)", found["under"]).groups())
     assert found["right"].endswith(f"mm at x {x + 1}, y {y}")
+    assert found["ball"] == pytest.approx(8.0, rel=0.02)
+
+
+def test_the_drawn_sensor_measures_nothing_else(seen):
+    start, image, depth = seen[0]["first"]
+    assert start == image and start.startswith("Which sensor is it? Choose it first") and depth == seen[0]["demo"]
+
+
+def test_a_frame_of_another_light_is_doubted(seen):
+    text, what = seen[0]["doubt"]
+    assert text.startswith("In doubt: ") and text.endswith("Take the background again.") and what.startswith("deepest at least ")
+    assert seen[0]["sure"] == ""
 
 
 def test_the_page_measures_as_python_does(seen):
@@ -129,11 +144,11 @@ def test_the_page_measures_as_python_does(seen):
 
 def test_a_camera_by_the_prior_of_its_type(seen):
     found, _, (_, press, rest), _ = seen
-    assert "off in the mean" in found["prior"]
+    assert found["prior"].endswith("mm by the prior of its type, normals 4.5° off in the mean")
     assert found["cameras"].endswith(".y4m") and found["still"].startswith("Still and untouched")
     assert re.search("touches the skin|Something moves", found["touched"]) and found["frozen"] == "Go on"
     assert found["taken"].startswith("The background is taken. Press something into the skin. Browsers may change")
-    assert re.match(r"320 x 240 of 640 x 480, measured in [\d.]+ ms, \d+ frames a second", found["rate"])
+    assert re.match(r"320 x 240 of 640 x 480, measured and shown in [\d.]+ ms, \d+ frames a second", found["rate"])
     background, image = planes(found["background"]), planes(found["planes"])  # Chromium turns YUV into RGB otherwise than OpenCV
     assert float((background - rest).abs().mean()) < 0.02 and float((image - press).abs().mean()) < 0.02
     unit = vts.calibrate(background, vts.Sensor.load("gelsight_mini"))
@@ -143,7 +158,9 @@ def test_a_camera_by_the_prior_of_its_type(seen):
 
 def test_images_in_place_of_a_camera(seen):
     found, _, (_, press, rest), _ = seen
-    assert found["contact"].startswith("Something touches the skin in this image") and found["before"] is None
+    why, again = found["contact"]
+    assert why.startswith("Something touches the skin, which reads as 0.5 mm deep around x 26") and again == "Take it all the same"
+    assert found["before"] is None
     plan = prior_unit(vts.Sensor.load("gelsight_mini")).freeze().with_background((rest * 255.0).round() / 255.0)
     assert difference(found["next"], plan, press) < 1e-6
 
@@ -159,8 +176,23 @@ def test_what_is_saved(seen):
     assert difference(found["depth"], vts.FrozenPipeline.load(saved / "unit.plan"), image) < 1e-6
 
 
+def test_presses_for_a_calibration(seen):
+    found, _, _, folder = seen
+    assert found["unsized"].startswith("How large is the ball?")
+    assert re.match(r"Kept: its depth is that of a ball of \d\.\d mm: \d+ % too (small|large)\. Press elsewhere", found["kept"])
+    assert "torchvts calibrate presses --sensor gelsight_mini" in found["zip"]
+    with zipfile.ZipFile(folder / "saved" / "presses.zip") as packed:
+        assert packed.testzip() is None
+        packed.extractall(folder / "saved")
+    background, (press,) = read_presses(folder / "saved" / "presses")
+    assert press.ball_diameter_mm == 6.31
+    for image, name in ((background, "background"), (press.image, "planes")):
+        assert float((image - planes(found[name])).abs().max()) < 1e-5
+
+
 def test_the_page_says_what_it_cannot_use(seen):
-    size, cut, other, broken, sound = seen[0]["refused"]
+    size, cut, other, broken, sound, calibration = seen[0]["refused"]
+    assert "torchvts view --web unit.safetensors" in calibration
     assert "light.png: expected 320 x 240 pixels, as the plan, or raw frames of 3280 x 2464 or 640 x 480, got 1280 x 680" in size
     assert "damaged: the plan should have" in cut and "Expected a plan (.plan), images or a video" in other
     assert "none.png: no image that this browser reads" in broken and "sound.webm: no video that this browser plays" in sound
@@ -184,7 +216,7 @@ def test_the_page_opens_without_a_network(seen):
 def test_the_page_plays_a_video(seen):
     found, (real, press, _) = seen[0], seen[2]
     assert found["name"] == "film.webm" or found["said"] == ""
-    assert re.match(r"320 x 240, measured in [\d.]+ ms, \d+ frames a second", found["film"])
+    assert re.match(r"320 x 240, measured and shown in [\d.]+ ms, \d+ frames a second", found["film"])
     deepest = float(re.match(r"deepest ([\d.]+) mm", found["what"]).group(1))
     assert abs(deepest - float(real(press[None]).depth_mm.max())) < 0.1  # the video has lost some of the image
 

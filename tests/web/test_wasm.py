@@ -12,6 +12,7 @@ from conftest import ROOT
 
 import torchvts as vts
 from lab import frames
+from torchvts.cli.web_page import prior_unit
 from torchvts.compiled import library
 
 MEASURE = """
@@ -19,7 +20,8 @@ import { readFileSync, writeFileSync } from "node:fs";
 import { Plan, library } from "./torchvts.js";
 const [wasm, folder] = process.argv.slice(2);
 const plan = new Plan(await library(readFileSync(wasm)), readFileSync(folder + "/unit.plan"));
-const { depth, contact } = plan.measure(readFileSync(folder + "/image.rgba"));
+const { depth, contact, conditions } = plan.measure(readFileSync(folder + "/image.rgba"));
+writeFileSync(folder + "/conditions.f32", conditions);
 writeFileSync(folder + "/depth.f32", depth);
 writeFileSync(folder + "/contact.u8", contact);
 let refused = "";
@@ -71,6 +73,15 @@ let why = "";
 try { rectify.image({ data, width: 10, height }, "raw"); } catch (error) { why = error.message; }
 console.log(why);
 """
+TOUCH = """
+import { readFileSync } from "node:fs";
+import { touchOf } from "./background.js";
+import { Plan, library } from "./torchvts.js";
+const [wasm, folder, count] = process.argv.slice(2);
+const plan = new Plan(await library(readFileSync(wasm)), readFileSync(folder + "/unit.plan"));
+const image = (k) => new Float32Array(new Uint8Array(readFileSync(`${folder}/${k}.f32`)).buffer);
+console.log(JSON.stringify(Array.from({ length: Number(count) }, (_, k) => touchOf(image(k), plan))));
+"""
 VIEWS = {
     "cropped": vts.Sensor.load("gelsight_mini"),
     "turned": vts.Sensor.load("digit"),
@@ -107,6 +118,28 @@ def test_a_real_press_in_node(wasm, data, tmp_path, mode):
     expected = frozen(image[None])
     assert float(expected.depth_mm.max()) > 0.2
     assert float((depth - expected.depth_mm[0, 0]).abs().max()) < 1e-6
+    conditions = torch.from_numpy(np.fromfile(tmp_path / "conditions.f32", np.float32))
+    light, lost, unseen_deg = frozen.with_conditions(image[None])[1]
+    assert torch.allclose(conditions, torch.cat((light.flatten(), lost[0], unseen_deg.deg2rad().tan())), atol=1e-5)
     assert int((contact ^ expected.contact[0, 0]).sum()) <= 2
     assert said["metric"] is True and said["about"]["mode"] == mode and said["pitch"] == pytest.approx(frozen.mm_per_pixel)
     assert said["refused"].startswith("not a plan") and said["size"].startswith("Expected an image of 320 x 240 pixels")
+
+
+@pytest.mark.parametrize("kind, folder", [("gelsight_mini", "gelsight_mini_a"), ("digit", "digit_b")])
+def test_a_press_is_no_background(wasm, data, tmp_path, kind, folder):
+    sensor = vts.Sensor.load(kind)
+    paths = [
+        data / folder / "background.png",
+        *sorted((data / folder).glob("*mm/*/gelsight.png" if kind == "gelsight_mini" else "ball*.png")),
+    ]
+    for k, path in enumerate(paths):
+        (tmp_path / f"{k}.f32").write_bytes(sensor.read_image(path).numpy().tobytes())
+    prior_unit(sensor).freeze().save(tmp_path / "unit.plan")
+    for name in ("torchvts.js", "background.js", "fit.js"):
+        shutil.copy(ROOT / "web" / name, tmp_path)
+    (tmp_path / "package.json").write_text('{"type": "module"}')
+    (tmp_path / "touch.mjs").write_text(TOUCH)
+    command = ["node", str(tmp_path / "touch.mjs"), str(wasm), str(tmp_path), str(len(paths))]
+    rest, *presses = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
+    assert rest == "" and all(text.startswith("Something touches the skin, which reads as ") for text in presses)

@@ -1,7 +1,7 @@
 /* The light of a frame over that of the background: Relight of torchvts/compensate/light.py, which explains it. */
 #include "plan.h"
 
-enum { TERMS = 6, FORMS = TERMS * (TERMS + 1) / 2, LANES = 8 };
+enum { TERMS = 6, FORMS = TERMS * (TERMS + 1) / 2, LANES = VECTOR / sizeof(double) };
 
 /* LANES values that one instruction works on, which may lie anywhere in memory. Of this type, all sums below stay in registers. */
 typedef double Lanes __attribute__((vector_size(sizeof(double) * LANES), aligned(sizeof(double)), may_alias));
@@ -40,12 +40,13 @@ static void take(const Plan *plan, const float *image, Samples *some, float *los
     for (int c = 0; c < 3; c++) {
         double valid = 0.0, usable = 0.0, *relative = some->relative + (size_t)c * n, *counts = some->counts + (size_t)c * n;
         const double *share = some->share + (size_t)c * n;
-        for (int k = 0; k < some->samples; k++) {
-            float largest, mean = sample(image + pixels * c, (int)plan->width, (int)plan->relight_stride, k / columns, k % columns, &largest);
+        for (int k = 0, row = 0, column = 0; k < some->samples; k++) {
+            float largest, mean = sample(image + pixels * c, (int)plan->width, (int)plan->relight_stride, row, column, &largest);
             const int lit = share[k] > 0.0 && mean > (float)plan->black, saturated = largest >= (float)plan->saturation_light;
             relative[k] = (double)(mean / plan->relight_skin[(size_t)c * some->samples + k]);
             some->lowest[(size_t)c * n + k] = saturated ? 0.0 : -HUGE_VAL;
             counts[k] = lit, valid += lit && !saturated, usable += share[k] > 0.0;
+            if (++column == columns) column = 0, row++;
         }
         lost[c] = (float)((usable - valid) / (usable > 1.0 ? usable : 1.0));
         known[c] = valid > (1.0 - plan->lost) * usable;

@@ -6,6 +6,10 @@
 #include "cosine.h"
 #include "plan.h"
 
+#if defined(__wasm_simd128__)
+#include <wasm_simd128.h>
+#endif
+
 static const double PI = 3.14159265358979323846;
 
 /* Coefficients from 0 on that depth gets wave by wave: they are nearly all of it, and a transform rounds them at each of its steps. */
@@ -80,43 +84,29 @@ static void divergence(const float *gradient, int height, int width, float half_
     }
 }
 
-/* Very small numbers become zero: the recursions run into them, and processors are a hundred times slower there. */
-static unsigned int without_tiny(void) {
-#if defined(__SSE__)
-    const unsigned int before = _mm_getcsr();
-    _mm_setcsr(before | 0x8040u);
-    return before;
-#else
-    return 0;
-#endif
-}
-
-static void with_tiny(unsigned int before) {
-#if defined(__SSE__)
-    _mm_setcsr(before);
-#else
-    (void)before;
-#endif
-}
+/* Added and taken away, it makes zero of what is far below 1e-30: the recursions run into such numbers, and processors are a hundred times slower
+   with those that a float cannot hold in full. */
+static const double LARGE = 1e-15;
 
 /* One step of a recursion, for each of n coefficients. */
 WIDE FUSED static void sum_up(const float *restrict values, const double *restrict pole, int n, double *restrict sum) {
-    for (int k = 0; k < n; k++) sum[k] = values[k] + pole[k] * sum[k];
+    for (int k = 0; k < n; k++) sum[k] = (values[k] + pole[k] * sum[k] + LARGE) - LARGE;
 }
 
-/* The same, whose sums take the values' place. */
-WIDE FUSED static void there(float *restrict values, const double *restrict pole, int n, double *restrict sum) {
-    for (int k = 0; k < n; k++) {
-        sum[k] = values[k] + pole[k] * sum[k];
-        values[k] = (float)sum[k];
-    }
+WIDE FUSED static void back(const float *restrict values, const double *restrict pole, const double *restrict gain, int n, double *restrict sum) {
+    for (int k = 0; k < n; k++) sum[k] = (gain[k] * values[k] + pole[k] * sum[k] + LARGE) - LARGE;
 }
 
-WIDE FUSED static void back(float *restrict values, const double *restrict pole, const double *restrict gain, int n, double *restrict sum) {
-    for (int k = 0; k < n; k++) {
-        sum[k] = gain[k] * values[k] + pole[k] * sum[k];
-        values[k] = (float)sum[k];
+/* Doubles to floats, n a multiple of 4. */
+WIDE static void narrow(const double *restrict sum, int n, float *restrict values) {
+#if defined(__wasm_simd128__) /* for which LLVM rounds one by one */
+    for (int k = 0; k < n; k += 4) {
+        const v128_t low = wasm_f32x4_demote_f64x2_zero(wasm_v128_load(sum + k)), high = wasm_f32x4_demote_f64x2_zero(wasm_v128_load(sum + k + 2));
+        wasm_v128_store(values + k, wasm_i64x2_shuffle(low, high, 0, 2));
     }
+#else
+    for (int k = 0; k < n; k++) values[k] = (float)sum[k];
+#endif
 }
 
 /* sum *= pole^exponent. power: n doubles. */
@@ -147,9 +137,9 @@ static void recursions(const Solver *of, int from, float *slice) {
     for (int x = 0; x < width; x++) sum_up(slice + (size_t)x * SLICE, pole, n, other);
     times_power(pole, width, n, power, other);
     begin(other, of->per_start + from, n, sum);
-    for (int x = 0; x < width; x++) there(slice + (size_t)x * SLICE, pole, n, sum);
+    for (int x = 0; x < width; x++) sum_up(slice + (size_t)x * SLICE, pole, n, sum), narrow(sum, n, slice + (size_t)x * SLICE);
     turn_round(slice + (size_t)(width - 1) * SLICE, of->end + from, n, sum);
-    for (int x = width - 1; x >= 0; x--) back(slice + (size_t)x * SLICE, pole, of->gain + from, n, sum);
+    for (int x = width - 1; x >= 0; x--) back(slice + (size_t)x * SLICE, pole, of->gain + from, n, sum), narrow(sum, n, slice + (size_t)x * SLICE);
 }
 
 /* The same for the constant along y, k = 0: sums of sums, less the mean. constant: its values, and gets the result. */
@@ -242,9 +232,7 @@ int integrate(const Plan *plan, Scratch *shared, const float *gradient, float *d
     memset(memory, 0, bytes);
     float *floats = (float *)(memory + width);
     const Memory at = {memory, floats, floats + coefficients, floats + coefficients + lines, floats + coefficients + lines + scratch};
-    const unsigned int before = without_tiny();
     solve_one(&of, gradient, 0.5f * (float)plan->mm_per_pixel, at, depth);
-    with_tiny(before);
     give_back(shared, taken);
     return DONE;
 }

@@ -235,7 +235,7 @@ int zero_background(const Plan *plan, Scratch *scratch, const float *weight, flo
     mean_depth(plan, depth, at.line, &at), widest_weight(plan, weight, (float *)at.line, &at);
     find_pressure(&at, plan->zero_decay);
     double low = at.depth[0], high = at.depth[0];
-    for (int k = 0; k < n; k++) low = fmin(low, at.depth[k]), high = fmax(high, at.depth[k]);
+    for (int k = 0; k < n; k++) low = at.depth[k] < low ? at.depth[k] : low, high = at.depth[k] > high ? at.depth[k] : high;
     const double reach = fmax(high - low, 1e-9);
     for (int k = 0; k < unknowns; k++) at.found[k] = 0.0;
     at.found[0] = start_of(&at, (float *)(memory + 7 * n), &any_free);

@@ -31,11 +31,19 @@ ANGLES = [math.radians(10 + 120 * k) for k in range(3)]  # red, green, blue: 500
 TRUE_LIGHTS = vts.PointLights([[31.25 * math.cos(a), 31.25 * math.sin(a), 39.375] for a in ANGLES], [1450.0] * 3)
 
 
+def ball(radius_px: float, press_px: float) -> scenes.Scene:
+    """A ball of a radius, pressed in: exact depth, normals and slopes."""
+    return scenes.sphere_press(radius_px * PITCH, press_px * PITCH, height=sensor.height, width=sensor.width, mm_per_pixel=PITCH)
+
+
+UNDEFORMED = scenes.undeformed(ball(RADIUS_PX, PRESSES_PX[0]))
+
+
 def image_of(scene: scenes.Scene, lights: vts.PointLights) -> Tensor:
     """The model's image, (1, 3, H, W).
 
     Eq. 1: a light S with albedo rho gives pixel P with normal n the value I = rho (S - P) . n / |S - P|^3.
-    Eq. 2: the three colours together are linear in the normal, I = L n.
+    Eq. 2: the three colours together are linear in the normal, I = L n; a row of the 3x3 matrix L is rho (S - P) / |S - P|^3.
     """
     return vts.near_field_shading(scene.depth_mm, scene.normal, lights, PITCH).detach()
 
@@ -67,16 +75,16 @@ def gradient_of(normal: Tensor) -> Tensor:
 def calibrate(background: Tensor) -> tuple[vts.PointLights, Tensor]:
     """Lights with their albedos, 12 numbers, and I_delta, of one image without contact.
 
-    Eq. 6: the lights minimise the distance of model and image, with z = 0 and n = (0, 0, 1) everywhere.
+    Eq. 6: the lights minimise |model - image|^2, with z = 0 and n = (0, 0, 1) everywhere. Here spots count less (Tukey's loss).
     Eq. 7: I_delta = model - image: spots on the skin, dead pixels. It is 0 elsewhere.
     """
-    lights = vts.fit_lights(background, sensor).lights
+    lights = vts.fit_lights(background, sensor, gloss=False).lights
     return lights, flat_image(lights) - background
 
 
 def flat_image(lights: vts.PointLights) -> Tensor:
     """The model's image of the flat skin, (3, H, W)."""
-    return image_of(scenes.undeformed(press_of(PRESSES_PX[0])), lights)[0]
+    return image_of(UNDEFORMED, lights)[0]
 
 
 def contact_area(light: Tensor, lights: vts.PointLights) -> Tensor:
@@ -104,10 +112,10 @@ def precise(image: Tensor, lights: vts.PointLights, delta: Tensor) -> Tensor:
 def by_table(image: Tensor, lights: vts.PointLights, delta: Tensor) -> Tensor:
     """GelSight's look-up table of slopes by the change of colour, learned from drawn presses of two balls."""
     flat = flat_image(lights)
-    balls = [scenes.sphere_press(radius, press) for radius, press in ((8.0, 1.5), (5.0, 1.0))]
-    inside = [ball.contact[0, 0] for ball in balls]
-    changes = [(photograph(ball)[0] + delta - flat)[:, seen].T for ball, seen in zip(balls, inside)]
-    slopes = [ball.gradient[0][:, seen].T for ball, seen in zip(balls, inside)]
+    presses = [ball(128, 24), ball(80, 16)]
+    inside = [press.contact[0, 0] for press in presses]
+    changes = [(photograph(press)[0] + delta - flat)[:, seen].T for press, seen in zip(presses, inside)]
+    slopes = [press.gradient[0][:, seen].T for press, seen in zip(presses, inside)]
     light = vts.Compensate(offset=delta)(image)
     normal = vts.NormalFromLookup.fit(flat, torch.cat(changes), torch.cat(slopes))(light)
     return depth_of(gradient_of(normal) * contact_area(light, lights))
@@ -118,22 +126,17 @@ def rms_difference_px(one_mm: Tensor, other_mm: Tensor) -> float:
     return float((one_mm - other_mm).square().mean().sqrt()) / PITCH
 
 
-def press_of(press_px: int) -> scenes.Scene:
-    """The ball, pressed in by so many pixels: exact depth, normals and slopes."""
-    return scenes.sphere_press(RADIUS_PX * PITCH, press_px * PITCH, height=sensor.height, width=sensor.width, mm_per_pixel=PITCH)
-
-
 def main() -> dict[int, tuple[float, float, float, float]]:
     """Print the table and draw the figure; returns by press, px: largest errors by eq. 9 and 10, and RMS with and without eq. 8."""
-    lights, delta = calibrate(photograph(scenes.undeformed(press_of(PRESSES_PX[0])))[0])
-    print(f"lights found within {(lights.position_mm - TRUE_LIGHTS.position_mm).abs().max():.4f} mm")
-    print("| press px | eq. 9: paper | here | eq. 10: paper | here | RMS | without eq. 8 | eq. 11: eq. 10 and look-up table |")
+    lights, delta = calibrate(photograph(UNDEFORMED)[0])
+    print(f"lights found within {(lights.position_mm - TRUE_LIGHTS.position_mm).abs().max():.0e} mm")
+    print("| press px | eq. 9: paper | here | eq. 10: paper | here | its RMS | RMS without eq. 8 | eq. 11: eq. 10 and table |")
     print("|---|---|---|---|---|---|---|---|")
     errors: dict[int, tuple[float, float, float, float]] = {}
     figure = viz.new_figure(9.0, 4.6)
     axes = figure.subplots(len(PRESSES_PX), 3, squeeze=False)
     for row, press_px in zip(axes, PRESSES_PX, strict=True):
-        scene = press_of(press_px)
+        scene = ball(RADIUS_PX, press_px)
         image = photograph(scene)
         depths = [method(image, lights, delta) for method in (fast, precise)]
         maps = [(depth - scene.depth_mm)[0, 0] / PITCH for depth in depths]
@@ -144,7 +147,7 @@ def main() -> dict[int, tuple[float, float, float, float]]:
         cells = [f"{v:.2f}" for v in (paper[0], largest[0], paper[1], largest[1])] + [f"{v:.3f}" for v in errors[press_px][2:]]
         print(f"| {press_px} | {' | '.join(cells)} | {rms_difference_px(depths[1], table):.2f} |")
         row[0].imshow(image[0].permute(1, 2, 0).numpy())
-        row[0].set_title(f"image, ball pressed in by {press_px} px")
+        row[0].set_title(f"ball pressed in by {press_px} px")
         for panel, error, equation in zip(row[1:], maps, ("eq. 9, fast", "eq. 10, precise")):
             shown = panel.imshow(error.numpy(), cmap="RdBu_r", vmin=-1.25, vmax=1.25)
             panel.set_title(f"{equation}: depth - truth")

@@ -5,11 +5,12 @@ All that triggers stands in :data:`TRIGGERS`, all that must not in :data:`ORDINA
 
 import dataclasses
 import json
+import re
 import warnings
 
 import pytest
 import torch
-from conftest import ring_lights
+from conftest import ROOT, ring_lights
 
 import torchvts as vts
 from lab import sets
@@ -209,9 +210,12 @@ def test_every_finding_has_a_frame_that_triggers_it(name):
     assert hit, str(found)
 
 
-def test_every_finding_of_the_table_is_triggered():
-    names = {check.name for check in CHECKS}
-    assert names <= {name.split(",")[0] for name in TRIGGERS}
+def test_every_finding_of_the_table_is_triggered_and_has_a_row_in_the_page():
+    names = {name.split(",")[0] for name in TRIGGERS}
+    assert {check.name for check in CHECKS} <= names
+    page = (ROOT / "docs" / "diagnose.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| ([a-z_, ]+?)(?: \(.*?\))? \|", page, re.MULTILINE)
+    assert names == {name for row in rows[1:] for name in row.split(", ")}
 
 
 @pytest.mark.parametrize("fitted", [False, True])

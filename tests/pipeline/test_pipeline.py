@@ -513,6 +513,33 @@ def test_precise_needs_normals_that_take_the_depth(ring, small_sensor):
         pipeline(ring(), small_sensor, "precise", normals=nn.Conv2d(3, 3, 1))
 
 
+class ZeroOfBorder(nn.Module):
+    """Depth counted from the median of the border; ``lost`` forgets to give a map back."""
+
+    def __init__(self, lost: bool):
+        super().__init__()
+        self.lost = lost
+
+    def forward(self, depth_mm: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
+        border = torch.cat((depth_mm[..., 0, :], depth_mm[..., -1, :], depth_mm[..., 0], depth_mm[..., -1]), dim=-1)
+        zero = border.median(dim=-1).values[..., None, None]
+        return zero if self.lost else depth_mm - zero
+
+
+def test_another_zero_takes_its_place(mixed, small_sensor):
+    lights, frames = mixed
+    pipe = pipeline(lights, small_sensor, "fast")
+    pipe.solve.zero = ZeroOfBorder(lost=False)
+    depth = pipe(frames).depth_mm
+    assert float((pipe.solve.zero(depth, depth) - depth).abs().max()) < 1e-6 < 0.1 < float(depth.max())
+    assert torch.allclose(torch.jit.script(pipe)(frames).depth_mm, depth, atol=1e-6)
+    frozen = pipe.freeze()
+    assert frozen.not_compiled == "solve.zero is ZeroOfBorder" and torch.equal(frozen(frames).depth_mm, depth)
+    pipe.solve.zero = ZeroOfBorder(lost=True)
+    with pytest.raises(ValueError, match=r"^zero: expected depth \[.*\] like that of integrate, got \[\d+, 1, 1, 1\]"):
+        pipe(frames)
+
+
 def test_another_integrator_takes_its_place(mixed, small_sensor):
     lights, frames = mixed
     pipe = pipeline(lights, small_sensor, "fast", integrate=vts.PoissonDST(small_sensor.mm_per_pixel))

@@ -33,6 +33,9 @@ _TYPES: dict[str, Any] = {
     "v": None,
 }
 
+AGAIN = "install again (in a checkout: make setup)"
+"""What makes a library that fits its sources."""
+
 
 @functools.cache
 def library() -> ctypes.CDLL | None:
@@ -43,7 +46,7 @@ def library() -> ctypes.CDLL | None:
     except (OSError, AttributeError):
         return None
     if built_from & 0xFFFFFFFF != zlib.crc32(b"".join(source.read_bytes() for source in sorted(LIBRARY.parent.glob("*.[ch]")))):
-        warnings.warn(f"{LIBRARY}: built from other sources than lie beside it, so it is not used: install again", stacklevel=2)
+        warnings.warn(f"{LIBRARY}: built from other sources than lie beside it, so it is not used: {AGAIN}", stacklevel=2)
         return None
     for name, types in SIGNATURES.items():
         result, *arguments = types.split()
@@ -56,7 +59,7 @@ def why_no_library() -> str:
     """Why :func:`library` gave none."""
     if not LIBRARY.exists():
         return "no C compiler was at hand when torchvts was installed"
-    return f"{LIBRARY} cannot be loaded on this machine, or was built from other sources: install again"
+    return f"{LIBRARY} cannot be loaded on this machine, or was built from other sources: {AGAIN}"
 
 
 def loaded() -> ctypes.CDLL:

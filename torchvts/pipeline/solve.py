@@ -65,4 +65,8 @@ class Solve(nn.Module):
     @torch.jit.export
     def integrated(self, frame: Frame, gradient: Tensor) -> Solution:
         """The solution of a gradient (B, 2, H, W) that is zero where the weight is."""
-        return Solution(gradient, self.zero(self.integrate(gradient), frame.weight))
+        integrated = self.integrate(gradient)
+        depth: Tensor = self.zero(integrated, frame.weight)
+        if depth.shape != integrated.shape:
+            raise ValueError(f"zero: expected depth {list(integrated.shape)} like that of integrate, got {list(depth.shape)}")
+        return Solution(gradient, depth)

@@ -26,8 +26,9 @@ out/venv/.done: pyproject.toml constraints.txt
 	out/venv/bin/pip install --quiet --disable-pip-version-check --constraint constraints.txt .
 	touch $@
 
-# A few minutes on two cores. A worker that has no tests left takes some of another's, so that none waits.
-PYTEST := $(BIN)/python -m pytest -n auto --dist worksteal
+# A few minutes on two cores. A worker that has no tests left takes some of another's, so that none waits. Tests are compiled once, not by
+# each worker each time, also where PYTHONDONTWRITEBYTECODE is set.
+PYTEST := PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -n auto --dist worksteal
 
 test: setup
 	$(PYTEST) -m "not long"

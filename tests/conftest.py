@@ -1,6 +1,8 @@
 """Rigs, data and ways to call that the tests share."""
 
 import contextlib
+import dataclasses
+import functools
 import io
 import json
 import os
@@ -19,6 +21,7 @@ import safetensors.torch
 import torch
 
 import torchvts as vts
+from lab.drawn_sensors import DrawnSensor, drawn_sensor
 from torchvts import compiled
 from torchvts.cli import COMMANDS, main
 from torchvts.core.files import checksum, load_tensors
@@ -88,6 +91,15 @@ def unit(tmp_path_factory):
     path = tmp_path_factory.mktemp("unit") / "unit.safetensors"
     vts.Calibration.from_lights(vts.PointLights(TINY_LIGHTS, [600.0] * 3), TINY_SENSOR, tiny_image(-1)).save(path)
     return path
+
+
+@functools.cache
+def half_drawn(seed):
+    """The drawn sensor of a seed with half of its rows and columns: a calibration of it takes a quarter of the time."""
+    whole = drawn_sensor(seed)
+    sensor = whole.sensor
+    size = {"height": sensor.height // 2, "width": sensor.width // 2, "mm_per_pixel": 2 * sensor.mm_per_pixel}
+    return DrawnSensor(seed, dataclasses.replace(sensor, **size), whole.optics, whole.reach_mm)
 
 
 class Frames:

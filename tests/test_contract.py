@@ -155,7 +155,6 @@ IN_PYTHON = ("AdaptiveIntegration",)
 """Blocks whose solver is Python code, which no script holds."""
 SCRIPTED = [name for name in CASES if name not in IN_PYTHON]
 every_block = pytest.mark.parametrize("name", CASES)
-every_scripted_block = pytest.mark.parametrize("name", SCRIPTED)
 
 
 def test_every_public_block_is_among_the_cases():
@@ -174,11 +173,6 @@ def build(name, dtype=torch.float32):
     """A block and an example of its input, a copy for each test."""
     block, example = made(name, dtype)
     return copy.deepcopy(block), example.clone()
-
-
-@functools.cache
-def scripted(name, dtype):
-    return torch.jit.script(made(name, dtype)[0])
 
 
 def outputs(result):
@@ -206,24 +200,19 @@ QUICKLY_OPTIMISED = [name for name in SCRIPTED if "Pipeline" not in name or name
     + [pytest.param(name, True, marks=pytest.mark.long) for name in SCRIPTED if name not in QUICKLY_OPTIMISED],
 )
 def test_torchscript_gives_what_eager_gives(name, optimised, dtype, tolerance):
+    """The script, and what its file holds."""
     block, example = build(name, dtype)
+    expected, script, stream = block(example), torch.jit.script(block), io.BytesIO()
     with torch.jit.optimized_execution(optimised):
-        assert_same(scripted(name, dtype)(example), block(example), tolerance)
-
-
-@every_scripted_block
-def test_a_script_survives_its_file(name):
-    block, example = build(name, torch.float64)
-    stream = io.BytesIO()
-    torch.jit.save(scripted(name, torch.float64), stream)
+        assert_same(script(example), expected, tolerance)
+    torch.jit.save(script, stream)
     stream.seek(0)
-    with torch.jit.optimized_execution(False):  # the test above optimises the same code
-        assert_same(torch.jit.load(stream)(example), block(example), 1e-11)
+    with torch.jit.optimized_execution(False):  # it is the same code
+        assert_same(torch.jit.load(stream)(example), expected, tolerance)
 
 
-@pytest.mark.parametrize(
-    "name", ["ContactMask", *(pytest.param(name, marks=pytest.mark.long) for name in ("ZeroBackground", "ContactFromDepth"))]
-)
+@pytest.mark.long
+@pytest.mark.parametrize("name", ["ZeroBackground", "ContactFromDepth"])  # test_export has ContactMask
 def test_torch_export_gives_what_eager_gives_of_any_batch(name):
     block, example = build(name)
     shapes = ({0: torch.export.Dim("batch", min=1, max=16)},)

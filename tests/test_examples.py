@@ -75,8 +75,9 @@ def test_example_confidence(run, tmp_path):
     assert (tmp_path / "out" / "confidence.png").is_file()
 
 
+@pytest.mark.long
 def test_example_paper(run, tmp_path):
-    """Figure 3 of the paper: 0.31 and 1.21 px by eq. 9, 0.09 and 0.16 px by eq. 10."""
+    """Figure 3 of the paper, which test_pipeline has too: 0.31 and 1.21 px by eq. 9, 0.09 and 0.16 px by eq. 10."""
     errors = run("paper")["found_px"]
     assert errors[16][:2] == pytest.approx((0.33, 0.12), abs=0.02) and errors[32][:2] == pytest.approx((1.24, 0.19), abs=0.02)
     assert all(filled < 0.4 * unfilled for *_, filled, unfilled in errors.values())  # eq. 8

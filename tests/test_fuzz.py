@@ -37,7 +37,7 @@ from torchvts.model.response_field import ResponseField, ResponseModel
 
 LONG = os.environ.get("TORCHVTS_TEST_PROFILE") == "long"
 pytestmark = [pytest.mark.long] * LONG
-DAMAGES, OF_CLOUDS = (3000, 60) if LONG else (25, 1)
+DAMAGES, OF_CLOUDS = (3000, 60) if LONG else (12, 1)
 """Damages of a file; of a point cloud, which a process of its own reads."""
 CLOUDS = ("cloud.pcd", "text.pcd", "small.pcd", "cloud.ply", "text.ply") if LONG else ("small.pcd", "text.ply")
 MEMORY = 2**30

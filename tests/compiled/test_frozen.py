@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses
+import functools
 import multiprocessing
 import pickle
 import re
@@ -13,7 +14,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from conftest import ring_lights, without_library
+from conftest import half_drawn, ring_lights, without_library
 from torch.autograd import forward_ad
 
 import torchvts as vts
@@ -31,6 +32,11 @@ DEPTH_MM = 1e-5
 """Frozen and plain depth differ by no more."""
 
 pytestmark = pytest.mark.skipif(library() is None and shutil.which("cc") is None, reason="no C compiler")
+
+
+def long(*values):
+    """A case of a grid that only make test-long runs."""
+    return pytest.param(*values, marks=pytest.mark.long)
 
 
 def agree(pipe, images, depth_mm=DEPTH_MM):
@@ -67,6 +73,7 @@ def test_a_plan_holds_the_fields_that_the_library_says():
 # ---- the same depth ----
 
 
+@functools.cache
 def lights_unit(size, pitch, **sensor):
     """A unit by lights, its camera, and images: pressed, at the border, noise, flat."""
     lights = ring_lights()
@@ -81,6 +88,7 @@ def lights_unit(size, pitch, **sensor):
     return vts.Calibration.from_lights(lights, vts.Sensor("rig", *size, pitch, **sensor), rest[0]), torch.cat([*images, noise])
 
 
+@functools.cache
 def response_unit(size, pitch, products=2, cubes=-1):
     """A unit by a response field with a blur, a defect and a drift of the light, and its frames."""
     generator = torch.Generator().manual_seed(3)
@@ -126,14 +134,9 @@ def marked_unit(size, pitch, side=3):
 UNITS = {"lights": lights_unit, "response": response_unit}
 
 
-def long(*values):
-    """A case of a grid that only make test-long runs."""
-    return pytest.param(*values, marks=pytest.mark.long)
-
-
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("kind", UNITS)
-@pytest.mark.parametrize("size", [(99, 131), (240, 320)], ids=str)
+@pytest.mark.parametrize("size", [(99, 131), long((240, 320))], ids=str)
 def test_frozen_and_plain_agree(kind, mode, size):
     calibration, images = UNITS[kind](size, 20.0 / size[1])
     found, _ = agree(vts.DepthPipeline.from_calibration(calibration, mode), images)
@@ -177,14 +180,30 @@ def test_saturated_backgrounds_and_leds_that_have_dimmed(mode, level):
 
 
 @pytest.mark.parametrize("mode", MODES)
-def test_a_led_that_has_failed_and_dirt(mode):
-    calibration, images = lights_unit((96, 128), 0.25)
-    failed, dirty = images[:1].clone(), images[:1].clone()
-    failed[:, 1] = 0.0
-    dirty[:, :, 40:44, 30:40] = 0.0
-    agree(vts.DepthPipeline.from_calibration(calibration, mode), dirty, 2e-3)
-    frozen = vts.DepthPipeline.from_calibration(calibration, mode).freeze()
-    assert bool(torch.isfinite(frozen(failed).depth_mm).all())
+def test_a_batch_of_a_led_that_has_failed_dirt_and_a_clean_frame(mode):
+    """Each frame is measured as it is alone: none takes the light or the dirt of another."""
+    calibration, images = lights_unit((48, 64), 0.5)
+    batch = images[:1].repeat(3, 1, 1, 1)
+    batch[0, 1] = 0.0
+    batch[1, :, 20:22, 15:20] = 0.0
+    pipe = vts.DepthPipeline.from_calibration(calibration, mode)
+    agree(pipe, batch[1:], 2e-3)
+    frozen = pipe.freeze()
+    together = frozen(batch)
+    assert bool(torch.isfinite(together.depth_mm).all())
+    for k in range(3):
+        assert all(torch.equal(one[k : k + 1], alone) for one, alone in zip(together, frozen(batch[k : k + 1]), strict=True))
+
+
+def test_a_drawn_sensor():
+    """All that presses tell of a skin is in its plan."""
+    unit = half_drawn(0)
+    balls = [unit.ball(5.0, 0.6, at_mm) for at_mm in ((-3.0, -2.0), (3.0, 2.0), (0.0, 0.0))]
+    calibration = vts.calibrate(unit.background, unit.sensor, balls)
+    images = torch.stack([unit.background, *(ball.image for ball in balls)])
+    for mode in MODES:
+        found, _ = agree(vts.DepthPipeline.from_calibration(calibration, mode), images, 1e-4)
+        assert float(found.depth_mm[1:].amax((1, 2, 3)).min()) > 0.3
 
 
 @pytest.mark.parametrize("mode", MODES)
@@ -208,7 +227,7 @@ def test_the_shadows_of_a_user_run_in_pytorch():
 
 
 @pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("side, size", [(3, (99, 131)), (18, (240, 321)), long(5, (120, 160)), long(26, (300, 401))], ids=str)
+@pytest.mark.parametrize("side, size", [(3, (99, 131)), (9, (120, 161)), long(26, (300, 401))], ids=str)
 def test_printed_markers(mode, side, size):
     calibration, images = marked_unit(size, 20.0 / size[1], side)
     assert calibration.markers.diameter_px > 0.5 * side
@@ -231,12 +250,11 @@ def test_a_pinhole_camera_and_other_integrators(mode):
         assert float((frozen(images).depth_mm - other(images).depth_mm).abs().max()) <= DEPTH_MM
 
 
-def test_the_real_mini(data):
-    """Presses of the first GelSight Mini, at its own size and half of it."""
-    for size, mode in (((240, 320), "precise"), ((480, 640), "fast")):
-        unit = frames.mini(data, size)
-        found, _ = agree(vts.DepthPipeline.from_calibration(unit.calibration, mode), unit.image)
-        assert float(found.depth_mm.max()) > 0.2
+@pytest.mark.parametrize("size, mode", [((240, 320), "precise"), long((480, 640), "fast")], ids=str)
+def test_the_real_mini(data, size, mode):
+    unit = frames.mini(data, size)
+    found, _ = agree(vts.DepthPipeline.from_calibration(unit.calibration, mode), unit.image)
+    assert float(found.depth_mm.max()) > 0.2
 
 
 @pytest.mark.parametrize("name, rest", [("gelslim_markers", "ref.jpg"), ("wyh_wedge_markers", "background.png")])
@@ -303,8 +321,15 @@ SETTINGS = {
 """Settings of blocks that a user may change."""
 
 
-@pytest.mark.parametrize("name", SETTINGS)
-@pytest.mark.parametrize("kind", UNITS)
+OF_BOTH = ("mask.", "contact.", "solve.zero.")
+"""Blocks that units of both kinds have: with a field is enough."""
+
+
+@pytest.mark.parametrize(
+    "kind, name",
+    [("response", name) for name in SETTINGS]
+    + [long("lights", name) if name.startswith(OF_BOTH) else ("lights", name) for name in SETTINGS],
+)
 def test_settings_changed_before_are_obeyed_or_refused(kind, name):
     calibration, images = response_unit((60, 80), 0.32) if kind == "response" else lights_unit((60, 80), 0.4, blur_px=1.0)
     pipe = vts.DepthPipeline.from_calibration(calibration, "precise")
@@ -317,7 +342,7 @@ def test_settings_changed_before_are_obeyed_or_refused(kind, name):
     if not_compiled:
         assert name.split(".")[0] in not_compiled
     else:
-        agree(pipe, images[:2])
+        agree(pipe, images[:1])
 
 
 class Own(vts.ContactMask):
@@ -569,7 +594,7 @@ scene = vts.scenes.sphere_press(8.0, 1.0, (0, 0), 96, 128, 0.25)
 images = vts.scenes.render(scene, lights).detach().repeat(8, 1, 1, 1)
 start = time.perf_counter(); expected = frozen(images); whole = time.perf_counter() - start
 generator, interrupted = torch.Generator().manual_seed(0), 0
-for k in range(60):
+for k in range(30):
     delay = 1.2 * whole * float(torch.rand((), generator=generator))
     timer = threading.Timer(delay, os.kill, (os.getpid(), signal.SIGINT))
     try:
@@ -596,10 +621,10 @@ print("interrupted", interrupted)
 
 
 def test_ctrl_c_in_the_middle_of_a_batch():
-    """60 times: no thread is left, no memory is freed under one, the next batch is right."""
+    """30 times: no thread is left, no memory is freed under one, the next batch is right."""
     done = subprocess.run([sys.executable, "-W", "ignore", "-c", INTERRUPTED], capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr[-2000:]
-    assert int(done.stdout.split()[-1]) > 30
+    assert int(done.stdout.split()[-1]) > 12
 
 
 def _depth(frozen, images, found):

@@ -1,6 +1,5 @@
 """A plan file: what is written is read again, by Python, C, and a reader made from its page alone; what is damaged is refused."""
 
-import os
 import pickle
 import re
 import shutil
@@ -17,14 +16,11 @@ from test_frozen import UNITS, lights_unit, marked_unit
 
 import torchvts as vts
 from torchvts.compiled import library, plan
+from torchvts.compiled.binding import LIBRARY
 
-CSRC = Path(vts.__file__).parent / "compiled" / "csrc"
+CSRC = LIBRARY.parent
 MODES = ("fast", "precise")
 KINDS = UNITS | {"marked": marked_unit}
-LONG = os.environ.get("TORCHVTS_TEST_PROFILE") == "long"
-DAMAGES = 10_000 if LONG else 100
-"""Damaged files of each unit."""
-
 pytestmark = pytest.mark.skipif(library() is None, reason="no compiled library")
 
 
@@ -134,14 +130,17 @@ def test_no_plan_is_read_without_a_file_or_a_library(saved, tmp_path):
         vts.FrozenPipeline.load(saved[0])
 
 
-SANITIZED = "-std=c11 -O1 -g -fsanitize=address,undefined,float-cast-overflow -fno-sanitize-recover=all -DSOURCES=0 -DWIDE="
+SANITIZED = "-std=c11 -O0 -g -w -fsanitize=address,undefined,float-cast-overflow -fno-sanitize-recover=all -DSOURCES=0 -DWIDE="
 """Flags of a program that ends at its first access of another's memory, or where C has no meaning."""
 
 
-def sanitized(source, folder):
-    """A program of a C file and the library's sources, with sanitizers."""
-    program = folder / source.stem
-    sources = [str(path) for path in (source, *sorted(CSRC.glob("*.c")))]
+@pytest.fixture(scope="module")
+def fuzz(tmp_path_factory):
+    """A program of fuzz_plan.c and the library's sources, with sanitizers."""
+    if shutil.which("cc") is None:
+        pytest.skip("no C compiler")
+    program = tmp_path_factory.mktemp("fuzz") / "fuzz_plan"
+    sources = [str(path) for path in (Path(__file__).parent / "fuzz_plan.c", *sorted(CSRC.glob("*.c")))]
     flags = [*SANITIZED.split(), "-ffp-contract=off", "-fno-strict-aliasing", "-I", str(CSRC)]
     done = subprocess.run(["cc", *flags, *sources, "-lm", "-o", str(program)], capture_output=True, text=True)
     if done.returncode and ("sanitize" in done.stderr or "lasan" in done.stderr):
@@ -150,30 +149,13 @@ def sanitized(source, folder):
     return program
 
 
-@pytest.fixture(scope="module")
-def fuzz(tmp_path_factory):
-    if shutil.which("cc") is None:
-        pytest.skip("no C compiler")
-    return sanitized(Path(__file__).parent / "fuzz_plan.c", tmp_path_factory.mktemp("fuzz"))
-
-
-@pytest.mark.long
-@pytest.mark.skipif(not LONG, reason="TORCHVTS_TEST_PROFILE=long")
-def test_ten_thousand_damaged_plans(saved, fuzz):
+@pytest.mark.parametrize("count", [40, pytest.param(10_000, marks=pytest.mark.long)])
+def test_damaged_plans(saved, fuzz, count):
     """Under sanitizers: none is accepted as it was not written; those whose checksum was made to fit touch no memory of others."""
-    check_fuzz(saved, fuzz)
-
-
-@pytest.mark.skipif(LONG, reason="the long test has more")
-def test_damaged_plans(saved, fuzz):
-    check_fuzz(saved, fuzz)
-
-
-def check_fuzz(saved, fuzz):
-    done = subprocess.run([str(fuzz), str(saved[0]), str(DAMAGES), "1"], capture_output=True, text=True, timeout=3000)
+    done = subprocess.run([str(fuzz), str(saved[0]), str(count), "1"], capture_output=True, text=True, timeout=3000)
     assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-4000:]
     read, refused, wrong = (int(number) for number in re.findall(r"\d+", done.stdout))
-    assert wrong == 0 and read + refused == DAMAGES and read > DAMAGES // 20 and refused > DAMAGES // 2
+    assert wrong == 0 and read + refused == count and read > count // 20 and refused > count // 2
 
 
 # ---- the example in C++ ----
@@ -181,25 +163,22 @@ def check_fuzz(saved, fuzz):
 EXAMPLE = ROOT / "examples" / "cpp"
 
 
-@pytest.fixture(scope="module")
-def program(tmp_path_factory):
-    """The program of examples/cpp, by CMake, or where there is none, by the system's compilers."""
-    if shutil.which("c++") is None:
-        pytest.skip("no C++ compiler")
+@pytest.fixture(scope="module", params=["the library", pytest.param("cmake", marks=pytest.mark.long)])
+def program(request, tmp_path_factory):
+    """The program of examples/cpp, with the library that was built for Python, or all by CMake."""
+    compiler = "c++" if request.param == "the library" else request.param
+    if shutil.which("c++") is None or shutil.which(compiler) is None:
+        pytest.skip(f"no {compiler}")
     folder = tmp_path_factory.mktemp("build")
-    if shutil.which("cmake"):
+    if compiler == "cmake":
         for command in (["cmake", "-S", str(EXAMPLE), "-B", str(folder)], ["cmake", "--build", str(folder)]):
             subprocess.run(command, check=True, capture_output=True)
-        return folder / "depth"
-    sources = [str(path) for path in sorted(CSRC.glob("*.c")) if path.name != "sources.c"]
-    subprocess.run(["cc", "-std=c11", "-O1", "-w", "-DWIDE=", "-ffp-contract=off", "-c", *sources], check=True, cwd=folder)
-    objects = [str(path) for path in folder.glob("*.o")]
-    command = ["c++", "-std=c++17", "-I", str(CSRC), str(EXAMPLE / "depth.cpp"), *objects, "-lm", "-o", str(folder / "depth")]
-    subprocess.run(command, check=True)
+    else:
+        files = [str(EXAMPLE / "depth.cpp"), str(LIBRARY), f"-Wl,-rpath,{LIBRARY.parent}", "-o", str(folder / "depth")]
+        subprocess.run(["c++", "-std=c++17", "-I", str(CSRC), *files], check=True)
     return folder / "depth"
 
 
-@pytest.mark.long
 def test_the_example_in_cpp_gives_the_depth_of_python(saved, program, tmp_path):
     path, frozen, images = saved
     pixels = (images[0] * 255.0).round().to(torch.uint8).permute(1, 2, 0).contiguous().numpy()

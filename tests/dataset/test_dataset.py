@@ -35,8 +35,8 @@ def film(path, count):
 
 @pytest.fixture(scope="module")
 def frames(tmp_path_factory):
-    """100 images in folders and a film of 20 frames."""
-    folder = fill(tmp_path_factory.mktemp("frames"), [f"{k // 40}/{k:03d}.png" for k in range(100)])
+    """40 images in folders and a film of 20 frames."""
+    folder = fill(tmp_path_factory.mktemp("frames"), [f"{k // 15}/{k:03d}.png" for k in range(40)])
     film(folder / "film.avi", 20)
     return folder
 
@@ -46,7 +46,7 @@ def whole(unit, frames, tmp_path_factory):
     """What one process makes of the frames when nothing disturbs it."""
     out = tmp_path_factory.mktemp("whole")
     report = reconstruct_dataset(unit, frames, out, workers=0)
-    assert (report.rows, report.before, report.failed) == (120, 0, [])
+    assert (report.rows, report.before, report.failed) == (60, 0, [])
     assert (out / "film_000019.npz").is_file()
     return contents(out)
 
@@ -99,22 +99,22 @@ def test_killed_processes_lose_nothing_and_the_next_run_goes_on(unit, frames, wh
     out = tmp_path / "out"
     launcher = () if killed == "the only" else TORCHRUN
     first = started(launcher, unit, frames, "--out", out, "--workers", 0)
-    wait_for(lambda: finished(out) >= 20, first)
+    wait_for(lambda: finished(out) >= 10, first)
     processes = family(first.pid)
     for pid in [max(processes)] if killed == "one" else processes:
         with contextlib.suppress(ProcessLookupError):  # its parent's death may have ended it
             os.kill(pid, signal.SIGKILL)
     first.communicate()
     done = finished(out)
-    assert first.returncode != 0 and 20 <= done < 120 and not (out / "frames.csv").exists()
+    assert first.returncode != 0 and 10 <= done < 60 and not (out / "frames.csv").exists()
     if killed == "one":  # any number of processes may go on
         report = reconstruct_dataset(unit, frames, out, workers=0)
-        assert report.rows == 120 and 0 < report.before <= done
+        assert report.rows == 60 and 0 < report.before <= done
     else:
         second = started(launcher, unit, frames, "--out", out)
         printed = second.communicate()[0]
-        assert second.returncode == 1 and "in doubt: 20 of 120 frames" in printed, printed  # the film is compressed
-        assert "wrote 120 frames" in printed and "by an earlier run" in printed
+        assert second.returncode == 1 and "in doubt: 20 of 60 frames" in printed, printed  # the film is compressed
+        assert "wrote 60 frames" in printed and "by an earlier run" in printed
     written = contents(out)
     assert written.pop("sheet.png", b"")  # the command draws it
     assert written == whole

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
@@ -262,7 +263,14 @@ def _factory(name: str) -> Callable[[Training], Any]:
     module, _, function = name.partition(":")
     if not module or not function:
         raise ValueError(f"expected module:factory, as in my_networks:normals, got {name!r}")
-    found: Callable[[Training], Any] | None = getattr(import_module(module), function, None)
+    if (here := str(Path.cwd())) not in sys.path:  # as python -m has it
+        sys.path.append(here)
+    try:
+        found: Callable[[Training], Any] | None = getattr(import_module(module), function, None)
+    except ModuleNotFoundError as error:
+        if error.name != module:  # what it imports itself
+            raise
+        raise ImportError(f"{name}: expected {module}.py in {here} or on PYTHONPATH, found none") from error
     if not callable(found):
         raise ValueError(f"{name}: expected a function {function} in {module}, got {type(found).__name__}")
     return found

@@ -485,6 +485,12 @@ def test_images_with_a_tangent_are_refused(unit):
         frozen(forward_ad.make_dual(unit[1], torch.ones_like(unit[1])))
 
 
+def test_a_frame_of_vmap_is_refused_with_a_sentence(unit):
+    frozen = vts.DepthPipeline.from_calibration(unit[0]).freeze()
+    with pytest.raises(RuntimeError, match=r"images: expected a batch of frames, got a frame of torch\.func\.vmap: call it on the"):
+        torch.func.vmap(lambda image: frozen(image[None]).depth_mm[0])(unit[1])
+
+
 def test_images_may_lie_anywhere_in_memory(unit):
     calibration, images = unit
     frozen = vts.DepthPipeline.from_calibration(calibration, "precise").freeze()

@@ -117,6 +117,29 @@ def test_torchscript_without_torchvts(low, mini, tmp_path, kind):
     assert export.compare(path, pipe, frames, "torchscript") <= 1e-5
 
 
+class AnyKeywords(nn.Module):
+    """A network that does not script."""
+
+    def __init__(self):
+        super().__init__()
+        self.slope = learned()
+
+    def forward(self, image, **unused):
+        return nn.functional.normalize(self.slope(image), dim=1)
+
+
+def test_a_network_that_does_not_script_is_exported_traced(low, tmp_path):
+    calibration, frames = low
+    network = AnyKeywords().eval()
+    pipe = pipeline(calibration, "fast", normals=network)
+    with pytest.raises(RuntimeError, match=r"(?s)pipe: expected modules that torch\.jit\.script takes.*torch\.jit\.trace.*unused"):
+        export.export_torchscript(pipe, tmp_path / "pipe.pt")
+    assert not (tmp_path / "pipe.pt").exists()
+    traced = pipeline(calibration, "fast", normals=torch.jit.trace(network, frames[:1]))
+    path = export.export_torchscript(traced, tmp_path / "pipe.pt")
+    assert export.compare(path, pipe, frames, "torchscript") <= 1e-5
+
+
 @pytest.mark.parametrize("optimised", [False, pytest.param(True, marks=pytest.mark.long)])
 def test_gradients_through_torchscript_without_torchvts(low, tmp_path, optimised):
     calibration, frames = low

@@ -5,6 +5,7 @@ import dataclasses
 import json
 import math
 import shutil
+import sys
 from functools import partial
 
 import pytest
@@ -187,6 +188,15 @@ def test_networks_of_ones_own_are_scored_beside_the_methods(run_script, monkeypa
     assert found["own_networks:normals"]["errors"]["used"] == 6
     for text, message in (("own_networks", "expected module:factory"), ("own_networks:other", "expected a function other in")):
         assert message in run_script("accuracy", folder, "--normals", text).stderr
+
+
+def test_networks_of_ones_own_are_found_in_the_working_folder(monkeypatch, tmp_path):
+    (tmp_path / "networks_here.py").write_text(OWN)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    monkeypatch.chdir(tmp_path)
+    assert [method.name for method in methods.own_methods("networks_here:normals", None)] == ["networks_here:normals"]
+    with pytest.raises(ImportError, match=r"no_networks:normals: expected no_networks\.py in .+ or on PYTHONPATH, found none"):
+        methods.own_methods("no_networks:normals", None)
 
 
 class FailingUnit:

@@ -82,7 +82,7 @@ def export_torchscript(pipe: DepthPipeline, path: str | Path, rectify: Rectify |
         path: the file.
         rectify: what makes its images of raw frames, which the file then takes; None for images that are rectified.
     Raises:
-        RuntimeError: a module of the pipeline does not script.
+        RuntimeError: a module of the pipeline does not script; says what to do, and where TorchScript stopped.
         TypeError: no pipeline, or no Rectify.
         ValueError: a Rectify that makes images of another size.
     """
@@ -91,7 +91,14 @@ def export_torchscript(pipe: DepthPipeline, path: str | Path, rectify: Rectify |
     with warnings.catch_warnings(), write_atomically(path) as temporary:
         warnings.simplefilter("ignore")  # that TorchScript is deprecated
         metadata = {f"{METADATA_KEY}.json": json.dumps(describe(pipe, rectify))}
-        scripted = torch.jit.script(copy.deepcopy(pipe if rectify is None else FromRaw(rectify, pipe)).eval())
+        whole = copy.deepcopy(pipe if rectify is None else FromRaw(rectify, pipe)).eval()
+        try:
+            scripted = torch.jit.script(whole)
+        except Exception as error:  # of many kinds, none of them a RuntimeError where the source of a module is not understood
+            raise RuntimeError(
+                "pipe: expected modules that torch.jit.script takes, got one that it does not: give a network as "
+                f"normals=torch.jit.trace(network.eval(), images), or write pt2 or ONNX: {error}"
+            ) from error
         scripted.save(str(temporary), _extra_files=metadata)  # type: ignore[no-untyped-call]
     return path
 

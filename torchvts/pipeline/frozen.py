@@ -241,6 +241,11 @@ class FrozenPipeline:
         if images.dtype != torch.float32 or not images.is_cpu:
             raise TypeError(f"images: expected torch.float32 on the CPU, got {images.dtype} on {images.device}: use .float().cpu()")
         check_same_size("images", images, "the calibration", *self._plan.size)
+        try:
+            images.data_ptr()
+        except RuntimeError:
+            check_range("images", images)  # says so of a frame of torch.func.vmap
+            raise
 
 
 def _of_bytes(content: bytes) -> FrozenPipeline:

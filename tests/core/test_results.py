@@ -70,6 +70,33 @@ def test_a_video_in_one_file_holds_its_frames(unit, source, results, tmp_path):
     assert (tmp_path / "film.npz").read_bytes() == before and not list(tmp_path.glob(".torchvts/parts/*"))
 
 
+def test_a_recording_as_zarr_has_a_row_for_each_frame(unit, tmp_path):
+    zarr = pytest.importorskip("zarr")
+    pixels = np.stack([bgr(tiny_image(k)) for k in range(7)])[..., ::-1].copy()
+    pixels[2] = 0  # a frame that cannot be used
+    np.save(tmp_path / "hand.npy", pixels)
+    options = {"workers": 0, "pictures": False, "background_frames": 0}
+    reconstruct_dataset(unit, tmp_path / "hand.npy", tmp_path / "single", **options)
+    for run in range(2):  # the second finds all done
+        report = reconstruct_dataset(unit, tmp_path / "hand.npy", tmp_path / "out", format="video-zarr", **options)
+        assert (report.rows, report.before, len(report.failed)) == (6, 6 * run, 1)
+    path = tmp_path / "out/hand.zarr.zip"
+    before = path.read_bytes()
+    store = zarr.open(zarr.storage.ZipStore(path, mode="r"), mode="r")
+    for k in (0, 1, 3, 4, 5, 6):
+        single = vts.read_result(tmp_path / f"single/hand_{k:06d}.npz")
+        for name, values in zip(("depth_mm", "normals", "gradient", "contact", "deformed"), single):
+            assert np.array_equal(store[name][k], values[0].squeeze(0).numpy())
+    assert np.isnan(store["depth_mm"][2]).all() and not store["contact"][2].any()
+    assert "one colour" in store.attrs["left_out"]["2"] and store.attrs["units"] == UNITS
+    assert (store.attrs["mm_per_pixel"], store.attrs["metric"], store.attrs["frame_doubts"]) == (PITCH, True, {})
+    path.unlink()
+    reconstruct_dataset(unit, tmp_path / "hand.npy", tmp_path / "out", format="video-zarr", **options)
+    assert path.read_bytes() == before and not list(tmp_path.glob("out/.torchvts/parts/*"))
+    reconstruct_dataset(unit, tmp_path / "hand.npy", tmp_path / "out", overwrite=True, format="npy", **options)
+    assert not path.exists()
+
+
 def test_every_third_frame_of_several_inputs(unit, source, tmp_path):
     (tmp_path / "more").mkdir()
     vts.write_image(tmp_path / "more" / "0.png", tiny_image(9))

@@ -53,7 +53,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_out(parser, "for the results, in the folders of the input")
     add_pipeline(parser)
     parser.add_argument("--every", type=int, default=1, metavar="N", help="each N-th frame of a video, each N-th image")
-    kinds = "npz (all), video-npz (one a video), png16, npy, none (npz)"
+    kinds = "npz (all), video-npz and video-zarr (one a video), png16, npy, none (npz)"
     parser.add_argument("--format", choices=FORMATS, default="npz", metavar="KIND", help=kinds)
     parser.add_argument(
         "--cloud", choices=CLOUD_FORMATS, default="none", metavar="KIND", help="contact: ply, pcd; surface: obj, x3p (metres)"

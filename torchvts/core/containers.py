@@ -14,11 +14,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .files import IMAGE_SUFFIXES, IN_COLOUR, Pixels, check_colour, decode_bytes, natural_order
+from .files import IMAGE_SUFFIXES, IN_COLOUR, Pixels, check_colour, check_still_head, decode_bytes, natural_order
 from .videos import video_reads
 
 BLOCK = 64
 """Frames of an array that are read at once, where its chunks are not smaller."""
+
+NAMED = 5
+"""So many arrays are named where none holds images."""
 
 EXTRA = "pip install 'torchvts[containers]'"
 
@@ -36,6 +39,10 @@ class Film(NamedTuple):
 
 
 Films = Mapping[str, Film]
+
+
+class NoImages(ValueError):
+    """A container that can be read and holds no images; says what it holds."""
 
 
 def _of_zarr(path: Path) -> Films:
@@ -67,12 +74,17 @@ def _of_npy(path: Path) -> Films:
 def _of_arrays(arrays: Iterable[tuple[str, Any]]) -> Films:
     """Those arrays that hold images: (T, H, W, 3), (T, N, H, W, 3) of N sensors, or T encoded ones, (T,) or padded (T, bytes)."""
     films: dict[str, Film] = {}
+    others: list[str] = []
     for name, array in arrays:
         colour = len(array.shape) > 3 and array.shape[-1] == 3 and array.dtype.kind in "uf"
-        if colour and len(array.shape) == 5 and array.shape[1] > 1:
+        if colour and len(array.shape) == 5:
             films |= {f"{name}/{k}": Film(array.shape[0], partial(_slices, array, (k,))) for k in range(array.shape[1])}
-        elif (colour and len(array.shape) in (4, 5)) or (len(array.shape) in (1, 2) and _is_encoded(array)):
-            films[name] = Film(array.shape[0], partial(_slices, array, (0,) if len(array.shape) == 5 else ()))
+        elif (colour and len(array.shape) == 4) or (len(array.shape) in (1, 2) and _is_encoded(array)):
+            films[name] = Film(array.shape[0], partial(_slices, array, ()))
+        else:
+            others.append(f"{name.strip('/')} {tuple(array.shape)} {array.dtype}".strip())
+    if not films and others:
+        raise NoImages(f"got {', '.join(others[:NAMED])}{', ...' if len(others) > NAMED else ''}")
     return films
 
 
@@ -86,8 +98,16 @@ def _is_encoded(array: Any) -> bool:
 def _slices(array: Any, index: tuple[int, ...]) -> Iterator[Callable[[], Any]]:
     step = min(BLOCK, (getattr(array, "chunks", None) or (1,))[0])
     for start in range(0, array.shape[0], step):
-        block = array[(slice(start, start + step), *index)]
-        yield from (partial(block.__getitem__, k) for k in range(len(block)))
+        try:
+            block = array[(slice(start, start + step), *index)]
+        except Exception as error:  # a damaged chunk: its frames cannot be read, those after it can
+            yield from (partial(_refuse, error) for _ in range(start, min(start + step, array.shape[0])))
+        else:
+            yield from (partial(block.__getitem__, k) for k in range(len(block)))
+
+
+def _refuse(error: Exception) -> Any:
+    raise ValueError(f"cannot be read: {error}") from error
 
 
 def _of_tar(path: Path) -> Films:
@@ -247,6 +267,9 @@ def _contains(file: Path, text: str) -> bool:
     return file.is_file() and text.encode() in file.read_bytes()
 
 
+EXPECTED = "expected frames (T, H, W, 3) or (T, N, H, W, 3), R, G, B, unsigned integers or floats"
+
+
 def open_film(path: Path) -> Film | None:
     """The recording that a path names in a container; None where the path leads into none.
 
@@ -262,6 +285,8 @@ def open_film(path: Path) -> Film | None:
         films = {name.strip("/"): film for name, film in container.read(place).items()}
     except ImportError as error:
         raise ImportError(f"{place}: {container.kind}, which needs {error.name}: {EXTRA}") from error
+    except NoImages as error:
+        raise ValueError(f"{place}: {container.kind} without images in colour: {EXPECTED}, {error}") from error
     except Exception as error:  # each library has errors of its own
         raise ValueError(f"{place}: not {container.kind}, or damaged: {error}") from error
     chosen = [name for name in films if not inside or name == inside or name.startswith(f"{inside}/")]
@@ -269,12 +294,13 @@ def open_film(path: Path) -> Film | None:
         film = films[chosen[0]]
         return film._replace(reads=lambda: _decoded(film, container.kind, path))
     if not films:
-        raise ValueError(f"{place}: {container.kind} without images in colour: expected frames (T, H, W, 3), R, G, B")
+        raise ValueError(f"{place}: {container.kind} without images in colour: {EXPECTED}")
     named = ", ".join(str(place / name) for name in (chosen or films))
-    raise ValueError(f"{path}: expected the path of one recording in {container.kind}, got {len(chosen)}: one of {named}")
+    raise ValueError(f"{path}: expected the path of one recording in {container.kind}, got {len(chosen) or 'none'}: one of {named}")
 
 
 def _decoded(film: Film, kind: str, path: Path) -> Iterator[Callable[[], Pixels]]:
+    read = None
     try:
         for read in film.reads():
             yield partial(_pixels, read, path)
@@ -282,6 +308,8 @@ def _decoded(film: Film, kind: str, path: Path) -> Iterator[Callable[[], Pixels]
         raise
     except Exception as error:  # each library has errors of its own
         raise ValueError(f"{path}: {kind} that is damaged or cut short: {error}") from error
+    if read is None:
+        raise ValueError(f"{path}: {kind} without a frame: T is 0")
 
 
 def _pixels(read: Callable[[], Any], path: Path) -> Pixels:
@@ -289,5 +317,6 @@ def _pixels(read: Callable[[], Any], path: Path) -> Pixels:
     value = read()
     array = np.frombuffer(value, np.uint8) if isinstance(value, bytes) else np.asarray(value)
     if array.ndim == 1:
+        check_still_head(array[:64].tobytes(), path)
         return check_colour(decode_bytes(array, IN_COLOUR, str(path)), path)
     return np.ascontiguousarray(check_colour(array, path)[:, :, ::-1])

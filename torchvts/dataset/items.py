@@ -18,9 +18,11 @@ STATE = ".torchvts"
 PARTS = "parts"
 """Folder beside the records where the frames of a video wait until it is done."""
 
-VIDEO_FORMAT = "video-npz"
-FORMATS = {"npz": ".npz", VIDEO_FORMAT: ".npz", "png16": "_depth.png", "npy": "_depth.npy", "none": ""}
-"""Kinds of results, and how the names of their files end."""
+VIDEO_FORMATS = {"video-npz": ".npz", "video-zarr": ".zarr.zip"}
+"""Kinds of results with one file a video, and how its name ends."""
+
+FORMATS = {"npz": ".npz", **dict.fromkeys(VIDEO_FORMATS, ".npz"), "png16": "_depth.png", "npy": "_depth.npy", "none": ""}
+"""Kinds of results, and how the names of the files of a frame end."""
 
 PICTURES_UP_TO = 20
 """Sources of at most this many frames get pictures by default: one picture takes longer than a hundred frames."""

@@ -69,7 +69,8 @@ def reconstruct_dataset(
         out: folder for results, made if missing.
         mode: "fast" or "precise".
         format: "npz" (depth, normals, gradient, masks, units; :func:`torchvts.read_result`), "video-npz" (the same, one file a
-            video), "png16" (depth in 16 bits), "npy" (depth) or "none".
+            video), "video-zarr" (the same as a zipped zarr store, row k for frame k), "png16" (depth in 16 bits), "npy" (depth)
+            or "none".
         cloud: contact as points, "ply" or "pcd", as a surface, "obj" or "x3p" (metres, of the sensor), or "none".
         length_unit: of the clouds, "mm" or "m"; they have the axes of the robot where the sensor has ``sensor_to_robot``.
         pictures: whether to draw each frame; None draws where there are at most ``PICTURES_UP_TO``.

@@ -16,7 +16,8 @@ from typing import Any
 
 from ..core.files import naming, write_atomically
 from ..core.results import join_results
-from .items import FORMATS, PARTS, STATE, VIDEO_FORMAT, Item, Source, list_items, one_line
+from ..core.zarr_results import join_as_zarr
+from .items import FORMATS, PARTS, STATE, VIDEO_FORMATS, Item, Source, list_items, one_line
 from .settings import Settings
 
 Record = dict[str, Any]
@@ -68,7 +69,7 @@ class Records:
         if record is None or "failed" in record or "bytes" not in record:
             return False
         files = list(self._files(item, frame, record))
-        if self.settings.format == VIDEO_FORMAT and frame >= 0 and _size(f"{self.out / item.stem}.npz") > 0:  # joined already
+        if frame >= 0 and (joined := self.joined_file(item)) is not None and joined.is_file():
             return bool([_size(file) for file in files[1:]] == record["bytes"][1:])
         return bool([_size(file) for file in files] == record["bytes"])
 
@@ -91,24 +92,34 @@ class Records:
 
     def result_file(self, item: Item, frame: int) -> Path:
         """Where the depth of a frame is written; for one file a video, where it waits until the video is done."""
-        folder = self.out / STATE / PARTS if self.settings.format == VIDEO_FORMAT and frame >= 0 else self.out
+        folder = self.out / STATE / PARTS if self.settings.format in VIDEO_FORMATS and frame >= 0 else self.out
         return folder / f"{item.frame_stem(frame)}{FORMATS[self.settings.format]}"
 
+    def joined_file(self, item: Item) -> Path | None:
+        """The one file of a video's frames; None where the format has one for each frame."""
+        suffix = VIDEO_FORMATS.get(self.settings.format)
+        return None if suffix is None else self.out / f"{item.stem}{suffix}"
+
     def join_videos(self) -> None:
-        """Make one npz of the frames of each video, where that is asked for."""
+        """Make one file of the frames of each video, where that is asked for."""
         for item in list_items(self.source):
-            length = self.length(item) if item.is_film else None
-            if self.settings.format != VIDEO_FORMAT or length is None:
+            length, path = self.length(item) if item.is_film else None, self.joined_file(item)
+            if path is None or length is None:
                 continue
-            records = ((frame, self.read(item, frame)) for frame in range(0, length, self.settings.every))
-            parts = [self.result_file(item, frame) for frame, record in records if record is not None and "failed" not in record]
-            there = [part for part in parts if part.is_file()]
+            numbers = range(0, length, self.settings.every)
+            records = {row: record for row, frame in enumerate(numbers) if (record := self.read(item, frame)) is not None}
+            left_out = {str(row): record["failed"] for row, record in records.items() if "failed" in record}
+            parts = {row: self.result_file(item, numbers[row]) for row in records if str(row) not in left_out}
+            there = [part for part in parts.values() if part.is_file()]
             if not there:
                 continue  # joined by an earlier run
             if len(there) < len(parts):
                 raise RuntimeError(f"{item.path}: {len(parts) - len(there)} frames have no result: run the same command again")
-            join_results(f"{self.out / item.stem}.npz", parts)
-            for part in parts:
+            if path.suffix == ".npz":
+                join_results(path, there)
+            else:
+                join_as_zarr(path, parts, len(numbers), left_out)
+            for part in there:
                 part.unlink()
 
     def _rows(self, item: Item) -> Iterator[tuple[str, Record | None]]:

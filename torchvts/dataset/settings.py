@@ -13,9 +13,16 @@ from pathlib import Path
 from ..core.checks import brief
 from ..core.files import make_folder, write_atomically
 from ..stream import FIRST_FRAMES
-from .items import FORMATS, PARTS, STATE, Source, has_few_frames
+from .items import FORMATS, PARTS, STATE, VIDEO_FORMATS, Source, has_few_frames
 
-SUFFIXES = (*filter(None, dict.fromkeys(FORMATS.values())), ".ply", ".obj", ".pcd", ".x3p", "_picture.png")
+SUFFIXES = (
+    *filter(None, dict.fromkeys((*FORMATS.values(), *VIDEO_FORMATS.values()))),
+    ".ply",
+    ".obj",
+    ".pcd",
+    ".x3p",
+    "_picture.png",
+)
 """How the names of all files of a frame end."""
 
 
@@ -61,7 +68,7 @@ def begin(source: Source, out: Path, settings: Settings, overwrite: bool) -> Set
             settings = replace(settings, pictures=has_few_frames(source, settings.every))
         with write_atomically(out / STATE / "settings.json") as temporary:
             temporary.write_text(json.dumps(asdict(settings), indent=1), encoding="utf-8")
-    incomplete = re.compile(r"\..+-[0-9a-f]{8}\.(png|npy|npz|pcd|ply|obj|x3p|csv|json)")  # names of write_atomically
+    incomplete = re.compile(r"\..+-[0-9a-f]{8}\.(png|npy|npz|zip|pcd|ply|obj|x3p|csv|json)")  # names of write_atomically
     for folder, folders, names in os.walk(out):
         folders[:] = [name for name in folders if name != STATE]
         for name in filter(incomplete.fullmatch, names):

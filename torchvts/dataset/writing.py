@@ -17,7 +17,6 @@ from ..pipeline import DepthOutput
 from ..pose import OutputFrame, write_point_cloud
 from ..pose.surface_files import X3P_AXES, write_obj, write_x3p
 from ..skin import SkinMotion
-from .items import VIDEO_FORMAT
 from .loading import Entry
 from .records import Records
 
@@ -39,8 +38,8 @@ class Writer:
         stem, path = self.records.out / frame.item.frame_stem(frame.number), self.records.result_file(frame.item, frame.number)
         for folder in {stem.parent, path.parent}:
             folder.mkdir(parents=True, exist_ok=True)
-        if self.settings.format == VIDEO_FORMAT and frame.number >= 0:  # what an earlier run joined is of other frames
-            (self.records.out / f"{frame.item.stem}.npz").unlink(missing_ok=True)
+        if frame.number >= 0 and (joined := self.records.joined_file(frame.item)) is not None:
+            joined.unlink(missing_ok=True)  # by an earlier run, of other frames
         if path.suffix == ".npz":
             write_result(path, result, self.facts, name, frame.doubt)
         elif path.suffix == ".png":

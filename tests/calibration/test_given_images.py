@@ -5,9 +5,9 @@ import warnings
 
 import pytest
 import torch
+from conftest import half_drawn
 
 import torchvts as vts
-from lab.drawn_sensors import drawn_sensor
 from torchvts.calibration.given_images import sort_presses
 from torchvts.calibration.resting import beside_presses
 from torchvts.core.views import Views
@@ -19,7 +19,7 @@ NUMBERS = (0, 3)
 @pytest.fixture(scope="module", params=NUMBERS)
 def given(request):
     """Background and presses of a drawn sensor."""
-    unit = drawn_sensor(request.param)
+    unit = half_drawn(request.param)
     return unit.background.float(), [dataclasses.replace(ball, image=ball.image.float()) for ball in unit.balls]
 
 
@@ -97,7 +97,7 @@ def test_one_image_with_two_diameters_is_refused(given):
 
 
 def test_presses_of_another_unit_are_refused():
-    one, other = drawn_sensor(0), drawn_sensor(5)
+    one, other = half_drawn(0), half_drawn(5)
     with pytest.raises(
         ValueError, match=r"presses: expected the light of the background, got .*: another unit, another light, or another crop"
     ):
@@ -143,7 +143,7 @@ def test_a_press_that_is_no_press_and_a_spot_on_the_lens_are_no_contact_in_the_b
 
 
 def test_one_press_with_swapped_channels_is_left_out_by_name():
-    unit = drawn_sensor(0)
+    unit = half_drawn(0)
     presses = [dataclasses.replace(ball, name=f"ball {k}") for k, ball in enumerate(unit.balls[:6])]
     presses[2] = dataclasses.replace(presses[2], image=presses[2].image.flip(0))
     with warnings.catch_warnings(record=True) as caught:

@@ -485,14 +485,6 @@ def test_good_presses_among_bad_ones_are_used(mixed, good, by_good):
 
 
 @pytest.mark.long
-def test_two_wrong_diameters_among_seven_count_little(good, rest):
-    wrong = [dataclasses.replace(p, ball_diameter_mm=12.0) for p in take_presses(count=8)[6:]]
-    calibration, _ = calibrate(rest, GIVEN, good[:5] + wrong)
-    weights = [row["weight"] for row in calibration.report["presses"]]
-    assert min(weights[:5]) > 0.5 and max(weights[5:]) < 0.15
-
-
-@pytest.mark.long
 def test_two_sizes_exchanged_are_warned_of(rest):
     """Then half of the presses contradict the other half, and none of them stands out."""
     presses = [dataclasses.replace(p, ball_diameter_mm=(4.0, 9.0)[k % 2]) for k, p in enumerate(take_presses(count=10))]
@@ -515,13 +507,7 @@ def test_lights_on_one_line_show_no_slopes_across_it():
     assert not unit.metric
 
 
-@pytest.mark.parametrize(
-    "count, times",
-    [
-        (3, 1.5),
-        *[pytest.param(n, t, marks=pytest.mark.long) for n, t in ((3, 1 / 1.9), (5, 1.5), (5, 1 / 1.5), (9, 1.5), (9, 1 / 1.5))],
-    ],
-)
+@pytest.mark.parametrize("count, times", [(3, 1.5), *(pytest.param(*odd, marks=pytest.mark.long) for odd in ((3, 0.53), (9, 1.5)))])
 def test_one_wrong_diameter_costs_no_good_press_and_hardly_moves_a_ball(rest, count, times):
     presses = take_presses(count=10)
     kept, odd = presses[:count], dataclasses.replace(presses[9], ball_diameter_mm=times * BALL_MM, name="odd")

@@ -8,10 +8,9 @@ import time
 
 import pytest
 import torch
-from conftest import bgr, write_film
+from conftest import bgr, half_drawn, write_film
 
 import torchvts as vts
-from lab.drawn_sensors import DrawnSensor, drawn_sensor
 from torchvts.cli.guide import Session, Watch
 from torchvts.scenes import objects
 from torchvts.stream.background import is_touched
@@ -28,9 +27,7 @@ STILL = 13
 @pytest.fixture(scope="module")
 def unit():
     """A drawn sensor of 120 x 160 pixels."""
-    large = drawn_sensor(3)
-    sensor = dataclasses.replace(large.sensor, height=120, width=160, mm_per_pixel=2 * large.sensor.mm_per_pixel)
-    return DrawnSensor(3, sensor, large.optics, large.reach_mm)
+    return half_drawn(3)
 
 
 @pytest.fixture(scope="module")

@@ -69,9 +69,8 @@ def test_one_graph_leads_from_the_camera_to_depth(pipe):
     assert bool(torch.isfinite(leaf.grad).all())
 
 
-@pytest.mark.parametrize(
-    "name", ["torchscript", pytest.param("pt2", marks=pytest.mark.long), pytest.param("onnx", marks=pytest.mark.long)]
-)
+@pytest.mark.long  # scripts of Rectify: test_contract; files without torchvts: test_export
+@pytest.mark.parametrize("name", ["torchscript", "pt2", "onnx"])
 def test_files_take_raw_frames_without_torchvts(pipe, tmp_path, name):
     if export.missing(name):
         pytest.skip(export.missing(name))

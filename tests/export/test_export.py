@@ -1,5 +1,6 @@
 """Exported files give what the pipeline gives, in a process that cannot import torchvts."""
 
+import itertools
 import json
 import subprocess
 import sys
@@ -37,11 +38,6 @@ def mini():
     return calibration, export.sample_frames(calibration)
 
 
-def long_to_write(*kinds):
-    """Pipelines whose graphs take minutes to write."""
-    return [pytest.param(kind, marks=pytest.mark.long) for kind in kinds]
-
-
 def pipeline(calibration, mode, **options):
     return vts.DepthPipeline.from_calibration(calibration, mode, **options)
 
@@ -52,6 +48,11 @@ def learned():
         block.weight.copy_(torch.eye(3)[:, :, None, None])
         block.bias.copy_(torch.tensor([-0.4, -0.4, 1.0]))
     return block.requires_grad_(False)
+
+
+def of_kind(calibration, kind):
+    """A pipeline by its name in the tables: lights or response and the mode, or own normals."""
+    return pipeline(calibration, "fast", normals=learned()) if kind == "own normals" else pipeline(calibration, kind.split()[1])
 
 
 def test_the_scenes_are_hard_enough(low, mini):
@@ -108,15 +109,6 @@ def test_onnx_of_an_image_whose_zero_has_cells_of_two(ring, tmp_path):
     assert export.compare(export.export_onnx(pipe, tmp_path / "pipe.onnx"), pipe, frames, "onnx") <= 1e-3
 
 
-@pytest.mark.parametrize("kind", long_to_write("response fast", "own normals", "lights fast", "lights precise", "response precise"))
-def test_torchscript_without_torchvts(low, mini, tmp_path, kind):
-    """The optimiser of TorchScript takes 10 s and more for a graph of several passes."""
-    calibration, frames = mini if kind.startswith("response") else low
-    pipe = pipeline(calibration, kind.split()[1]) if kind != "own normals" else pipeline(calibration, "fast", normals=learned())
-    path = export.export_torchscript(pipe, tmp_path / "pipe.pt")
-    assert export.compare(path, pipe, frames, "torchscript") <= 1e-5
-
-
 class AnyKeywords(nn.Module):
     """A network that does not script."""
 
@@ -170,11 +162,12 @@ def test_gradients_through_torchscript_without_torchvts(low, tmp_path, optimised
     assert (found["mode"], found["mm_per_pixel"], found["height"], found["width"]) == ("precise", PITCH, HEIGHT, WIDTH)
 
 
-@pytest.mark.parametrize("kind", long_to_write("response precise", "own normals", "lights precise"))
+@pytest.mark.long
+@pytest.mark.parametrize("kind", ["response precise", "own normals", "lights precise"])
 def test_a_program_takes_the_decisions_of_the_pipeline(low, mini, tmp_path, kind):
     """Passes and dark pixels in the graph, against the Python of the pipeline; then from its file, without torchvts."""
     calibration, frames = mini if kind == "response precise" else low
-    pipe = pipeline(calibration, kind.split()[1]) if kind != "own normals" else pipeline(calibration, "fast", normals=learned())
+    pipe = of_kind(calibration, kind)
     program = export.export_program(pipe, tmp_path / "pipe.pt2").module()
     for batch in (frames[:1], frames[1:3], frames[:3], frames[3:], frames):
         wanted = pipe(batch)
@@ -209,27 +202,32 @@ def own_chain(calibration, frames):
     return pipe
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("name, writer, suffix", [("onnx", export.export_onnx, "onnx"), ("pt2", export.export_program, "pt2")])
-def test_a_chain_with_own_normals_and_masks_without_torchvts(low, tmp_path, name, writer, suffix):
-    """As TorchScript below, which takes less time to write."""
+WRITERS = {
+    "torchscript": (export.export_torchscript, 1e-5),
+    "onnx": (export.export_onnx, 1e-3),
+    "pt2": (export.export_program, 1e-4),
+}
+"""Of each format: what writes it, and by how much its depth may differ, mm."""
+CALIBRATED = ("response fast", "response precise", "lights fast", "lights precise")
+
+
+@pytest.mark.long  # some graphs take minutes to write
+@pytest.mark.parametrize(
+    "name, kind",
+    [
+        *itertools.product(("torchscript", "onnx"), CALIBRATED),
+        ("torchscript", "own normals"), ("onnx", "own chain"), ("pt2", "own chain"),
+    ],
+)  # fmt: skip
+def test_files_run_without_torchvts(low, mini, tmp_path, name, kind):
     if export.missing(name):
         pytest.skip(export.missing(name))
-    calibration, frames = low
-    pipe = own_chain(calibration, frames)
-    path = tmp_path / f"pipe.{suffix}"
-    writer(pipe, path)
-    assert export.compare(path, pipe, frames, name) <= 1e-4
-
-
-@pytest.mark.parametrize("kind", long_to_write("response fast", "response precise", "lights fast", "lights precise"))
-def test_onnx_without_torchvts(low, mini, tmp_path, kind):
-    if export.missing("onnx"):
-        pytest.skip(export.missing("onnx"))
     calibration, frames = mini if kind.startswith("response") else low
-    pipe = pipeline(calibration, kind.split()[1])
-    path = export.export_onnx(pipe, tmp_path / "pipe.onnx")
-    assert export.compare(path, pipe, frames, "onnx") <= 1e-3
+    pipe = own_chain(calibration, frames) if kind == "own chain" else of_kind(calibration, kind)
+    write, most_mm = WRITERS[name]
+    path = tmp_path / f"pipe.{name}"
+    write(pipe, path)
+    assert export.compare(path, pipe, frames, name) <= most_mm
 
 
 @pytest.mark.parametrize("height, width", [(24, 32), (23, 35)])

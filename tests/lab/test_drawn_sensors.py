@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from conftest import half_drawn
 
 from lab.drawn_sensors import OBJECTS, drawn_sensor
 from lab.metrics import normal_angle_deg
@@ -42,7 +43,8 @@ def test_skin_solves_the_obstacle_problem():
 
 
 @pytest.mark.parametrize("name", OBJECTS)
-def test_depth_agrees_with_its_gradient_and_touches_only_where_it_is_deformed(unit, name):
+def test_depth_agrees_with_its_gradient_and_touches_only_where_it_is_deformed(name):
+    unit = half_drawn(3)
     scene = next(pressed for pressed in unit.objects if pressed.name == name).scene
     middle = scene.depth_mm - scene.depth_mm.mean()
     again = poisson_background(scene.gradient, unit.sensor.mm_per_pixel)
@@ -71,11 +73,17 @@ def test_labels_of_balls_are_exact(unit):
     assert press.contact_radius_px * pitch < math.sqrt(2.5**2 - 2.0**2)  # the skin leaves the ball before the undeformed plane
 
 
-@pytest.mark.parametrize("seed, most_missing_mm", [(3, 0.055), pytest.param(5, 0.085, marks=pytest.mark.long)])
-def test_the_second_pass_learned_from_balls_carries_over_to_other_objects(seed, most_missing_mm):
+@pytest.mark.parametrize(
+    "unit_of, seed, most_missing_mm, most_share",
+    [
+        (half_drawn, 3, 0.055, 0.99),
+        *(pytest.param(drawn_sensor, *of, 0.97, marks=pytest.mark.long) for of in ((3, 0.055), (5, 0.085))),
+    ],
+)
+def test_the_second_pass_learned_from_balls_carries_over_to_other_objects(unit_of, seed, most_missing_mm, most_share):
     """Better in the mean than the first, and on no object worse by 5 %: a second pass that balls teach shapes would be.
     Depth counts from the undeformed skin, so skin that hangs free around the object must not be left out."""
-    unit = drawn_sensor(seed)
+    unit = unit_of(seed)
     calibrated = by_presses(unit.background, unit.sensor, unit.balls, None, False)[0]
     errors = {}
     for mode in ("fast", "precise"):
@@ -86,7 +94,7 @@ def test_the_second_pass_learned_from_balls_carries_over_to_other_objects(seed, 
         errors[mode] = [float(normal_angle_deg(out.normal, p.scene.normal, p.scene.contact).mean()) for out, p in pairs]
         missing = [float((p.scene.depth_mm - out.depth_mm)[p.scene.contact].mean()) for out, p in pairs]
         assert 0.0 < sum(missing) / len(missing) < most_missing_mm  # without the tail 0.076 and 0.112
-    assert sum(errors["precise"]) < 0.97 * sum(errors["fast"]) and sum(errors["fast"]) / len(OBJECTS) < 4.5
+    assert sum(errors["precise"]) < most_share * sum(errors["fast"]) and sum(errors["fast"]) / len(OBJECTS) < 4.5
     assert all(second < 1.05 * first for first, second in zip(errors["fast"], errors["precise"], strict=True))
 
 

@@ -19,8 +19,8 @@ def test_every_method_and_corruption_has_a_kept_breaking_point():
 
 
 ROBUST = "precise, discontinuities"
-KINDS = ("noise", "attached shadows", "defocus", "cut by the border")
-"""Of camera, light, optics and press, one corruption each; the others are measured again by make test-long."""
+KINDS = ("noise", "attached shadows")
+"""Of camera and light, one corruption each; the others are measured again by make test-long."""
 QUICK = [
     pytest.param(name, ("fast", "precise"), id=f"{name}, fast and precise", marks=[] if name in KINDS else [pytest.mark.long])
     for name in CORRUPTIONS

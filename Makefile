@@ -26,9 +26,15 @@ out/venv/.done: pyproject.toml constraints.txt
 	out/venv/bin/pip install --quiet --disable-pip-version-check --constraint constraints.txt .
 	touch $@
 
+WASM := web/torchvts.wasm
+CSRC := torchvts/compiled/csrc
+
 # A few minutes on two cores. A worker that has no tests left takes some of another's, so that none waits. Tests are compiled once, not by
 # each worker each time, also where PYTHONDONTWRITEBYTECODE is set.
 PYTEST := PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -n auto --dist worksteal
+
+# The tests of the page need its library, where there is Node to run it.
+test test-coverage test-long: $(if $(shell command -v node),$(WASM))
 
 test: setup
 	$(PYTEST) -m "not long"
@@ -85,8 +91,6 @@ release:
 	cd $(RELEASE) && empty/bin/torchvts --version && empty/bin/python -c "import torchvts; print(*torchvts.shipped_sensors())"
 
 # The compiled frame for browsers and Node, web/torchvts.wasm, by zig of PyPI in an environment of its own; ZIG=zig takes another.
-WASM := web/torchvts.wasm
-CSRC := torchvts/compiled/csrc
 ZIG ?= $(CURDIR)/out/zig/bin/python -m ziglang
 
 wasm: $(WASM)

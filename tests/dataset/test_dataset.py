@@ -263,7 +263,7 @@ def test_the_script_ends_with_status_1_where_a_frame_was_left_out(unit, tmp_path
 def test_small_files_suffice_for_loader_processes(unit, frames, tmp_path, small_files):
     with small_files(60_000):  # an image of 96 x 128 px has more bytes, a result has fewer
         report = reconstruct_dataset(unit, frames / "0", tmp_path / "out", pictures=False, format="none", workers=2)
-    assert report.rows == 40 and report.failed == []
+    assert report.rows == 15 and report.failed == []
 
 
 def test_the_callers_threads_are_as_before(unit, tmp_path):

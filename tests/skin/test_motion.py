@@ -40,6 +40,14 @@ def test_the_background_itself_has_not_moved():
     assert int(moved.seen.sum()) >= 70 and float(moved.displacement_mm.abs().max()) < 1e-4 * PITCH
 
 
+def test_images_and_depth_of_another_precision_give_the_same():
+    motion = motion_of(CLEAN)
+    images, depth = frame(CLEAN, PRESS)
+    wanted = motion(images, depth).displacement_mm
+    for found in (motion(images.double(), depth), motion(images, depth.double())):
+        assert torch.equal(found.displacement_mm, wanted)
+
+
 @pytest.mark.parametrize("across, down", [(1, 0), (0, -2), (3, 2), (-4, 3)])
 def test_a_shift_by_whole_pixels_is_found_exactly(across, down):
     motion = motion_of(CLEAN)

@@ -199,6 +199,8 @@ class SkinMotion(nn.Module):
     def forward(self, images: Tensor, depth_mm: Tensor, last: DotMotion | None = None) -> DotMotion:
         """Images (B, 3, H, W) in [0, 1], their depth (B, 1, H, W), mm, and the motion of the frames before, of B frames or one.
 
+        Images and depth of another precision than the module's are brought to that, which the motion has.
+
         Raises:
             ValueError: shapes that differ from the background's or from each other. TypeError: not floating point.
         """
@@ -207,6 +209,7 @@ class SkinMotion(nn.Module):
         check_same_size("images", images, "the calibration", self.height, self.width)
         check_same_size("depth_mm", depth_mm, "images", self.height, self.width)
         check_same_count("depth_mm", depth_mm, "images", images.shape[0])
+        images, depth_mm = images.to(self.rest_px.dtype), depth_mm.to(self.rest_px.dtype)
         start = self.rest_px[None]
         if last is not None:
             if not torch.jit.is_scripting():

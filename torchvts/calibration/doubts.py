@@ -236,7 +236,8 @@ def not_checked(contacts: Sequence[Contact], sensor: Sensor, width: Width, depth
         width: of the contacts, see :func:`width_of`.
         depth_mm: of presses, by the calibration; who pressed knows about how deep they were.
     """
-    deep = f", by which the presses are {min(depth_mm):.2g} to {max(depth_mm):.2g} mm deep" if depth_mm else ""
+    which = "the presses" if len(depth_mm) == len(used(contacts)) else f"{len(depth_mm)} of the presses"
+    deep = f", by which {which} are {min(depth_mm):.2g} to {max(depth_mm):.2g} mm deep" if depth_mm else ""
     if sensor.prior is not None:
         return Doubt(
             f"{NOT_CHECKED}: the sensor's prior shows a wrong diameter or mm_per_pixel only beyond a factor of "

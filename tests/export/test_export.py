@@ -88,6 +88,15 @@ def test_a_program_of_a_mask_whose_cells_are_larger_than_pixels(cells_of_two):
             assert torch.allclose(found, expected, atol=1e-6) and bool(expected.any()) and not bool(expected.all())
 
 
+def test_a_program_of_normals_whose_lights_are_blocked(low):
+    calibration, frames = low
+    pipe = pipeline(calibration, "fast")
+    compensated = pipe.compensate(frames)
+    with torch.no_grad():
+        program = torch.export.export(pipe.normals, (compensated,)).module()
+        assert (program(compensated) - pipe.normals(compensated)).abs().max() < 1e-6
+
+
 @pytest.mark.long
 def test_a_program_of_an_image_whose_cells_are_larger_than_pixels(cells_of_two, tmp_path):
     """The program that was written, and its file without torchvts."""

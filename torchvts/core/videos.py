@@ -31,7 +31,7 @@ def video_reads(path: Path) -> Iterator[Callable[[], Pixels]]:
 
     def read() -> Pixels:
         there, pixels = capture.retrieve()
-        if not there:
+        if not there or pixels is None:  # a frame can be "there" and empty
             raise ValueError(f"{path}: frame {number} cannot be decoded")
         return pixels  # type: ignore[no-any-return]
 

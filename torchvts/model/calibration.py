@@ -236,6 +236,7 @@ class Calibration:
         light, noise, markers, printed = _measure(background, sensor, background.dtype)
         if covariance is not None:
             check_tensor("covariance", covariance)
+            check_shape("covariance", covariance, (response.field.size(),) * 2, "one row for each coefficient of a slope")
             covariance = covariance.detach().cpu().float()
             covariance = 0.5 * (covariance + covariance.mT)
         return cls(sensor, None, light, noise, True, summary, response, markers, covariance=covariance, printed=printed)

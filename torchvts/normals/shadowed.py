@@ -244,7 +244,7 @@ class ShadowedPixels(nn.Module):
         rows = view.albedo[None, :, None] * to_light * (squared.rsqrt() / squared)
         intensity, lost = image[b, :, row, column], failed[b]
         saturated = (intensity >= self.saturated_above[:, row, column].t()) | lost | (intensity <= 0.5 * self.left_out)
-        std = self.of_all_channels().expand(len(start))
+        std = self.of_all_channels().expand(start.shape[0])
         pixels = DarkPixels(
             start, intensity * (~lost).to(intensity.dtype), rows, saturated, std, self.brightness_std(std), view.gloss
         )

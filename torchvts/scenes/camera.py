@@ -93,7 +93,7 @@ def skin_spots(height: int, width: int, spots: int = 30, dead_pixels: int = 30, 
         The factor (1, 1, H, W) in [0, 1].
     """
     check_image_size("height", height, "width", width)
-    check_integer("spots", spots, 0), check_integer("dead_pixels", dead_pixels, 0)
+    check_integer("spots", spots, 0, 10_000), check_integer("dead_pixels", dead_pixels, 0)
     generator = torch.Generator().manual_seed(check_seed("seed", seed))
     x, y = pixel_grid_mm(height, width, 1.0)
     factor = torch.ones(height, width)

@@ -231,7 +231,7 @@ def gear(teeth: int = 12) -> Height:
 
 def textured_patch(bumps: int = 60, radius_mm: float = 5.5, seed: int = 3) -> Height:
     """A round pad with bumps and dents of random sizes at random places."""
-    check_integer("bumps", bumps, 1), check_positive("radius_mm", radius_mm)
+    check_integer("bumps", bumps, 1, 10_000), check_positive("radius_mm", radius_mm)
     generator = torch.Generator().manual_seed(check_seed("seed", seed))
     draws = torch.rand(bumps, 5, generator=generator, dtype=torch.float64)
     reach, turn = radius_mm * draws[:, 0].sqrt(), 2.0 * math.pi * draws[:, 1]

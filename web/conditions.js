@@ -14,7 +14,7 @@ export function doubtsOf(conditions) {
     if (!(level > 1 / MOST && level < MOST)) parts.push(`channel ${name} has ${percent(level)} of its light in the background`);
   });
   const low = unseen > UNSEEN_DEG;
-  if (low) parts.push(`slopes below ${unseen.toFixed(0)} degrees could not be seen, and depth is too low`);
+  if (low) parts.push(`slopes below ${unseen.toFixed(0)} degrees are in doubt, and depth may be too low`);
   if (Math.max(...uneven) > UNEVEN) parts.push("the light is not that of the background, nor a smooth change of it");
   return { low, text: parts.length ? `In doubt: ${parts.join("; ")}. ${REMEDY}` : "" };
 }

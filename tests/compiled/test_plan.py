@@ -89,8 +89,8 @@ def with_number(content, name, value):
 REFUSED = {
     "empty": (lambda x: b"", "not a plan: 0 bytes are too few"),
     "another file": (lambda x: b"\x89PNG" + x[4:], "not a plan: it does not begin as one"),
-    "an earlier version": (lambda x: x[:8] + b"\1" + x[9:], "a plan of version 1, and this library reads version 2: save it again"),
-    "a later version": (lambda x: x[:8] + b"\3" + x[9:], "a plan of version 3, and this library reads version 2: save it again"),
+    "an earlier version": (lambda x: x[:8] + b"\1" + x[9:], "a plan of version 1, and this library reads version 3: save it again"),
+    "a later version": (lambda x: x[:8] + b"\4" + x[9:], "a plan of version 4, and this library reads version 3: save it again"),
     "cut": (lambda x: x[:-64], "damaged: the plan should have .* bytes"),
     "a byte that flipped": (lambda x: x[:5000] + bytes([x[5000] ^ 8]) + x[5001:], "its bytes are not those that were written"),
     "cut, and signed": (lambda x: signed(x[:-128]), "slopes_of_depth: expected it in the plan, which ends before"),

@@ -190,7 +190,7 @@ def test_a_given_calibration_is_held_against_the_first_frames(unit):
         with streams.TactileStream(Frames([camera(0.0, level) for _ in range(12)]), calibration) as stream:
             assert not any(bool(frame.output.contact.any()) for frame in stream)
             assert stream.conditions.light[0, :, 0].tolist() == pytest.approx([level] * 3, abs=0.01)
-    doubted = pytest.warns(UserWarning, match=r"frame 0: .*could not be seen")
+    doubted = pytest.warns(UserWarning, match=r"frame 0: .*are in doubt")
     with streams.TactileStream(Frames([255 - camera() for _ in range(13)]), calibration) as stream, doubted:
         list(stream)
     with pytest.raises(ValueError, match="background_frames: expected at least 12 frames from made up, got 4"):
@@ -722,7 +722,7 @@ def test_what_came_before_ctrl_c_is_kept(run_stream, unit_file, video, tmp_path,
     assert signal.getsignal(number) == before
 
 
-@pytest.mark.filterwarnings("ignore:frame .* could not be seen")
+@pytest.mark.filterwarnings("ignore:frame .* are in doubt")
 def test_the_golf_ball_appears_and_vanishes(data):
     video = data / "wedge_video" / "golf_ball.avi"
     with streams.TactileStream(video, vts.Sensor.load("gelsight_wedge")) as stream:

@@ -1,6 +1,7 @@
 """Whether a background shows the skin at rest: beside presses, or read as a frame by the prior of the sensor's type."""
 
 import dataclasses
+import math
 from collections.abc import Sequence
 
 import torch
@@ -71,7 +72,7 @@ def read_as_frame(unit: Calibration) -> str:
         unit: by the prior of its type, which has seen nothing of this background.
     """
     smooth = dataclasses.replace(unit, background=_smooth(unit))
-    depth, weight = depth_of(smooth, unit.background_value.float())
+    depth, weight = depth_of(smooth, unit.background_value.float(), math.inf)  # what a polynomial leaves is smooth, too
     depth = depth * (weight > 0)
     deepest = float(depth.max())
     if deepest < LEAST_MM:

@@ -13,6 +13,7 @@ from ..integration import PoissonDCT
 from ..model.calibration import Calibration
 from ..normals import NormalFromIntensity, NormalFromResponse
 from ..skin import BLUR_MM, SHARE, ContactFromDepth, ContactMask, ZeroBackground, moved
+from ..skin.weight import MOST_SPREAD
 from .contacts import Contact
 from .presses import Press
 
@@ -57,14 +58,19 @@ def with_contact(
     return unit, [float(depth[circle].max()) for depth, _, circle in seen]
 
 
-def depth_of(calibration: Calibration, image: Tensor) -> tuple[Tensor, Tensor]:
-    """Depth, mm, of an image (3, H, W) by one pass, and how surely its skin has moved, (1, 1, H, W) each."""
+def depth_of(calibration: Calibration, image: Tensor, most_spread: float = MOST_SPREAD) -> tuple[Tensor, Tensor]:
+    """Depth, mm, of an image (3, H, W) by one pass, and how surely its skin has moved, (1, 1, H, W) each.
+
+    ``most_spread``: that of undeformed skin, see :class:`~torchvts.skin.ContactMask`.
+    """
     sensor = calibration.sensor
     with torch.no_grad():
         compensated = Compensate.from_calibration(calibration).float()(image.detach().cpu().float()[None])
         block = NormalFromIntensity if calibration.lights is not None else NormalFromResponse
         gradient = GradientFromNormal()(block.from_calibration(calibration).float()(compensated))
-        weight = ContactMask.from_calibration(calibration).float()(compensated, gradient)
+        mask = ContactMask.from_calibration(calibration).float()
+        mask.most_spread = most_spread
+        weight = mask(compensated, gradient)
         return ZeroBackground(sensor.mm_per_pixel)(PoissonDCT(sensor.mm_per_pixel)(gradient * weight), weight), weight
 
 

@@ -16,7 +16,7 @@ from .binding import check_memory, loaded
 
 Values = dict[str, Any]
 
-VERSION = 2
+VERSION = 3
 """Of the file; csrc/load.h has it too."""
 
 LINE = 64

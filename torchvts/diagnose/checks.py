@@ -409,7 +409,7 @@ CHECKS = (
           "uneven by {uneven:.1%}: what is smooth is divided out, gamma, saturation, ambient light or another unit are not: set "
           "the camera as at calibration, shade the sensor, or recalibrate", _by_unevenness, above=LEAST_LIGHT),
     Check("unseen_slopes", _unseen, "the least changed skin scatters {times:.0f} times as much as at calibration: slopes below "
-          "{value:.0f} degrees could not be seen", "note", above=UNSEEN_DEG),
+          "{value:.0f} degrees are in doubt", "note", above=UNSEEN_DEG),
     Check("new_spots", _spots, "{value:.0f} spots that were not there at calibration ({share:.1%} of the image{dead}): clean the "
           "skin, or recalibrate", lambda figures: "warning" if figures["share"] > 0.001 else "note"),
     Check("skin_changed", _wear, "the skin's brightness has changed by {value:.1%} (RMS), unevenly and nearly equally "

@@ -1,4 +1,4 @@
-"""What frames were seen under, in words: light that is uneven otherwise than at calibration, and slopes that could not be seen."""
+"""What frames were seen under, in words: light that is uneven otherwise than at calibration, and slopes that are in doubt."""
 
 import torch
 from torch import Tensor
@@ -61,7 +61,7 @@ def doubts_of(conditions: Conditions, usual_deg: float) -> list[str]:
         if float(unseen) > UNSEEN_DEG:
             parts.append(
                 f"skin without contact looks {float(unseen) / usual_deg:.0f} times as rough as at calibration: slopes below "
-                f"{float(unseen):.0f} degrees could not be seen, and depth is too low"
+                f"{float(unseen):.0f} degrees are in doubt, and depth may be too low"
             )
         if float(uneven.max()) > UNEVEN:
             each = ", ".join(f"{name} {float(one):.0%} +- {float(off):.0%}" for name, one, off in zip("RGB", level, uneven))

@@ -72,6 +72,10 @@ EDGE_DEPTH_SHARE = 1.5
 """The same for depth: a blurred kink of depth is too low by 0.4 of what another blur takes 0.165 from, at most; 95 % of a Gaussian
 error lie within 1.96 standard deviations."""
 
+ALIKE = 0.5
+"""Share of the variance of a response field's slopes that is alike over all of a contact, as a gain; half of it as a tilt along each
+axis. What is left changes its sign within the contact. Of point lights all of it is alike."""
+
 GRID_PX2 = 0.6
 """Variance of the blur of normals by differences of depth, px^2: a box of two pixels, and the mean of two neighbours."""
 
@@ -238,6 +242,7 @@ class Confidence(nn.Module):
         self.black, self.saturated = BLACK, SATURATED
         self.usual_change = CHANGE_SCALE
         self.curl_share, self.edge_share, self.edge_depth_share = CURL_SHARE, EDGE_SHARE, EDGE_DEPTH_SHARE
+        self.as_gain, self.as_tilt = (1.0, 1.0) if self.by_lights else (ALIKE, 0.5 * ALIKE)
         self.kink_variance_mm = (KINK_PX * mm_per_pixel) ** 2
         self.register_buffer("noise", noise_std.detach().clone())
         self.register_buffer("image_noise", image_noise_std.detach().clone())
@@ -418,7 +423,7 @@ class Confidence(nn.Module):
         growth = 0.2 + torch.log1p(torch.sqrt(count / math.pi)) / (2.0 * math.pi)
         scatter = mean * growth * (self.correlation * self.mm_per_pixel) ** 2
         kink = self.kink_variance_mm * gradient.square().sum(dim=(1, 2, 3), keepdim=True) / count
-        variance = scatter + kink + found[1:].square().sum(0)
+        variance = scatter + kink + self.as_gain * found[1].square() + self.as_tilt * found[2:].square().sum(0)
         if self.blur_px > 0.0:  # what blur took from edges
             taken = (blur(out.depth_mm, self.weights) - out.depth_mm).square()
             variance = variance + self.edge_depth_share * nn.functional.max_pool2d(taken, 2 * self.reach + 1, 1, self.reach)

@@ -22,6 +22,12 @@ WEIGHT_RISE = (1.2, 3.0)
 LEAST_SLOPE_SPREAD = 0.002
 """Least spread of slopes and of relative changes of light: half a count of 8 bits."""
 
+MOST_SPREAD = 0.012
+"""The same at most, beside noise: skin that hangs far around a contact is undeformed nowhere, and its slopes are smooth."""
+
+ROUGH = 1.57
+"""Most spread that is noise, over the median difference of neighbouring cells: one and a half times that of white noise."""
+
 WITHIN = 2.5
 """Standard deviations within which undeformed skin lies."""
 
@@ -90,6 +96,7 @@ class ContactMask(nn.Module):
         self.sigmas, self.by_colour = check_least("sigmas", sigmas, 1.0, 1000.0), check_switch("by_colour", by_colour)
         self.cells, self.rise, self.grey_share, self.failed = WEIGHT_CELLS, WEIGHT_RISE, GREY_SHARE, FAILED
         self.weights, self.least_spread = gaussian_weights(BLUR_CELLS), LEAST_SLOPE_SPREAD
+        self.most_spread, self.rough = MOST_SPREAD, ROUGH
         flat = torch.ones(3, 1, 1) if flat is None else flat
         check_field("flat", flat)
         self.register_buffer("flat", flat.detach().clone())
@@ -133,12 +140,12 @@ class ContactMask(nn.Module):
         cell = max(1, min(height, width) // self.cells)
         change = self.change(compensated, cell)
         grey = change.mean(dim=1, keepdim=True)
-        evidence = length_in_spreads(change - grey, self.grey_share * grey, self.least_spread)
+        evidence = self.lengths(change - grey, self.grey_share * grey)
         if gradient is not None:
             check_batch("gradient", gradient, 2)
             check_same_count("gradient", gradient, "compensated", compensated.shape[0])
             check_same_size("gradient", gradient, "compensated", height, width)
-            by_slopes = length_in_spreads(whole_cell_means(gradient, cell), torch.zeros_like(grey), self.least_spread)
+            by_slopes = self.lengths(whole_cell_means(gradient, cell), torch.zeros_like(grey))
             evidence = torch.minimum(evidence, by_slopes) if self.by_colour else by_slopes
         per_noise = whole_cell_means(self.per_noise[None], cell) if self.per_noise.shape[1] > 1 else self.per_noise[None]
         evidence = evidence * per_noise
@@ -155,6 +162,19 @@ class ContactMask(nn.Module):
         lit = change.detach().mean(dim=(2, 3), keepdim=True) > self.failed - 1.0
         return change * lit.to(change.dtype)
 
+    def lengths(self, means: Tensor, beside: Tensor) -> Tensor:
+        """Length (B, 1, h, w) of vectors (B, C, h, w), each component in units of its spread in the frame's least changed cells.
+
+        Root mean square over the two dimensions that slopes have, and changes of colour (three components of zero sum). ``beside``:
+        (B, 1, h, w), a spread of its own that each cell has beside that of the frame.
+        """
+        spread = spread_of(means.abs().flatten(2) + 1e-6, self.least_spread)  # so that the root has a slope at zero
+        steps = (means[..., 1:] - means[..., :-1]).detach().abs().flatten(2).sort(dim=2).values
+        most = (self.rough * steps[:, :, steps.shape[2] // 2]).clamp_min(max(self.most_spread, self.least_spread))
+        spread = torch.minimum(spread, most[..., None])[..., None]
+        squared = (means.square() / (spread.square() + beside.square())).sum(dim=1, keepdim=True)
+        return torch.sqrt(0.5 * squared + 1e-12)
+
     def weight(self, evidence: Tensor) -> Tensor:
         """Weight of cells by their evidence, both (B, 1, h, w)."""
         weight = ((evidence - self.rise[0]) / (self.rise[1] - self.rise[0])).clamp(0.0, 1.0)
@@ -170,17 +190,6 @@ def colour_of_slopes(lights: PointLights) -> float:
     change = position[:, :2] / position[:, 2:]  # of each light, relative, by a unit slope along x and y
     colour = torch.linalg.svdvals(change - change.mean(dim=0))
     return float(colour.amin() / change.norm(dim=1).amax())
-
-
-def length_in_spreads(means: Tensor, beside: Tensor, least: float = LEAST_SLOPE_SPREAD) -> Tensor:
-    """Length (B, 1, h, w) of vectors (B, C, h, w), each component in units of its spread in the frame's least changed cells.
-
-    Root mean square over the two dimensions that slopes have, and changes of colour (three components of zero sum). ``beside``:
-    (B, 1, h, w), a spread of its own that each cell has beside that of the frame.
-    """
-    spread = spread_of(means.abs().flatten(2) + 1e-6, least)[..., None]  # so that the root has a slope at zero
-    squared = (means.square() / (spread.square() + beside.square())).sum(dim=1, keepdim=True)
-    return torch.sqrt(0.5 * squared + 1e-12)
 
 
 def spread_of(

@@ -5,7 +5,7 @@
 #include "plan.h"
 #include "torchvts.h"
 
-enum { PLAN_VERSION = 2 };
+enum { PLAN_VERSION = 3 };
 
 /* Reads and checks a file that lies at a multiple of LINE; its tables stay where they are. 0 if it is refused, with a reason. The text about it follows
    the first LINE bytes. */

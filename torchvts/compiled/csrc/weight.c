@@ -67,13 +67,23 @@ static float spread_of(const Plan *plan, const float *means, int n, float *some)
     return spread;
 }
 
-/* Length of vectors of `parts` planes of n values, each in units of its spread; `beside` is a spread of its own that each has, or null. Returns the
+/* The most that the spread of means (rows, columns) may be: that of noise, which neighbours do not share. some: 2 n floats. */
+static float most_spread(const Plan *plan, const float *means, int rows, int columns, float *some) {
+    const int n = rows * (columns - 1);
+    for (int y = 0, k = 0; y < rows; y++)
+        for (int x = 1; x < columns; x++) some[k++] = fabsf(means[y * columns + x] - means[y * columns + x - 1]);
+    const float noise = (float)plan->rough * sorted(some, some + n, n)[n / 2];
+    return fmaxf(noise, (float)fmax(plan->most_spread, plan->least_spread));
+}
+
+/* Length of vectors of `parts` planes (rows, columns), each in units of its spread; `beside` is a spread of its own that each has, or null. Returns the
    largest spread. */
-static WIDE float lengths(const Plan *plan, const float *means, int parts, const float *beside, int n, float *some, float *length) {
+static WIDE float lengths(const Plan *plan, const float *means, int parts, const float *beside, int rows, int columns, float *some, float *length) {
+    const int n = rows * columns;
     float largest = 0.0f;
     memset(length, 0, sizeof(float) * (size_t)n);
     for (int c = 0; c < parts; c++, means += n) {
-        const float spread = spread_of(plan, means, n, some), square = spread * spread;
+        const float spread = spread_of(plan, means, n, some), taken = fminf(spread, most_spread(plan, means, rows, columns, some)), square = taken * taken;
         largest = spread > largest ? spread : largest;
         if (beside)
             for (int k = 0; k < n; k++) length[k] += means[k] * means[k] / (square + beside[k] * beside[k]);
@@ -174,12 +184,12 @@ int weigh(const Plan *plan, Scratch *scratch, const float *light, const float *g
     int code = DONE;
     if (plan->by_colour || !plan->takes_slopes) {
         change_of_colour(plan, light, rows, columns, line, change, grey);
-        lengths(plan, change, 3, grey, n, some, evidence);
+        lengths(plan, change, 3, grey, rows, columns, some, evidence);
     }
     *unseen = NAN;
     if (plan->takes_slopes) {
         for (int c = 0; c < 2; c++) cell_means(gradient + (size_t)c * height * width, width, cell, rows, columns, line, change + (size_t)c * n);
-        *unseen = (float)plan->rise_to * lengths(plan, change, 2, NULL, n, some, other);
+        *unseen = (float)plan->rise_to * lengths(plan, change, 2, NULL, rows, columns, some, other);
         for (int k = 0; k < n; k++) evidence[k] = plan->by_colour ? fminf(evidence[k], other[k]) : other[k];
     }
     for (int k = 0; k < n; k++) evidence[k] *= plan->mask_noise[k];

@@ -1,5 +1,6 @@
 """Recordings in containers, each written by its own library: the frames are those of the same images, and depth is too."""
 
+import argparse
 import io
 import json
 import sys
@@ -13,6 +14,7 @@ from conftest import bgr, tiny_image, write_film
 
 import torchvts as vts
 from torchvts import stream as streams
+from torchvts.cli.options import split_files
 from torchvts.core.containers import _of_message
 from torchvts.core.recordings import count_frames
 from torchvts.dataset import reconstruct_dataset
@@ -210,7 +212,11 @@ def test_frames_and_depth_are_those_of_the_same_images(write, unit, depths, tmp_
 
 def test_one_of_several_recordings_is_named(tmp_path):
     path = write_tar(tmp_path).parent
-    for read in (vts.frames, streams.open_source, count_frames):
+
+    def alone(path):
+        return split_files(argparse.Namespace(files=[str(path)], sensor=None, background=None, press=[]))
+
+    for read in (vts.frames, streams.open_source, count_frames, alone):
         with pytest.raises(ValueError, match=r"recording in a WebDataset, got 2: one of .*two\.tar/left\.png, .*two\.tar/right"):
             read(path)
         with pytest.raises(

@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from conftest import Frames
 from refusals_values import *
 
 import torchvts as vts
@@ -120,7 +119,7 @@ TABLE = {
         "sensor_or_calibration": [None, "gelsight_mini"], "mode": ["slow", None], "background_frames": INTEGER, "presses": [],
         "network": [], "device": [], "contact": ["4.5", 4.5], "record": []}, run=False),
     "stream.Recorder": Entry(
-        {"reader": Frames([]), "path": "raw"}, {"reader": [], "path": ["raw.avi", None, 2.5]}, named={"path": "record"}, run=False),
+        {"path": "raw", "fps": 30.0}, {"path": ["raw.avi", None, 2.5], "fps": []}, named={"path": "record"}, run=False),
     "stream.VideoFile": Entry(
         {"path": "film.avi", "fps": 10.0}, {"path": ["film.gif", "film"], "fps": NUMBER}, named={"path": "video"}),
     "stream.open_source": Entry({"source": ..., "reconnect_s": 0.0, "settings": vts.stream.CameraSettings()}, {

@@ -47,7 +47,7 @@ PARTS = {
     "as_normal_model", "by_presses", "channel_structure", "check_calibration", "check_domain", "check_sensor",
     "OutputFrame.", "doubts_of", "light_levels", "light_unevenness",
     "DotMotion.", "scenes.DottedSkin.", "scenes.Drag.", "motion_of_unit", "moved", "read_point_cloud", "stream.FrameCheck.",
-    "stream.NewestFrame", "stream.Overlay", "stream.Recorder.", "stream.Recording.", "stream.StageClock",
+    "stream.Overlay", "stream.Recorder.", "stream.Recording.", "stream.StageClock",
     "stream.CameraSettings", "stream.Camera", "stream.Keys", "stream.LiveView", "stream.Sheet", "stream.StreamReport.",
     "stream.TactileStream.rezero", "stream.VideoFile.", "stream.find_camera", "stream.has_screen",
     "read_result", "stream.check_device", "stream.read_background", "stream.read_press_images", "stream.require_rerun",

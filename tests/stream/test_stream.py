@@ -10,6 +10,7 @@ import signal
 import sys
 import threading
 import warnings
+from collections import deque
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -24,7 +25,8 @@ import torchvts as vts
 from torchvts import stream as streams
 from torchvts.core.files import rgb_from_bgr
 from torchvts.pipeline import unit_pipeline
-from torchvts.stream.sources import times_file
+from torchvts.stream.numbered import Played
+from torchvts.stream.sources import SETTLING, LiveReader, times_file
 
 ROOT = Path(__file__).resolve().parents[2]
 PITCH = 0.25
@@ -477,44 +479,42 @@ class Scripted:
 
 
 def test_who_comes_late_finds_only_the_newest_frame():
-    reader = Scripted()
-    newest = streams.NewestFrame(reader)
-    reader.asked.acquire()
+    camera = Scripted()
+    reader = LiveReader(lambda: camera)
+    camera.asked.acquire()
+    camera.give(SETTLING - 1)
+    camera.allowed.release()  # the last one while exposure settles: no other is asked for
+    reader.drop_late()
+    camera.asked.acquire()
     for number in range(3):  # fast: each frame is taken before the next
-        reader.give(1)
-        assert newest.take()[0] == number
-    assert newest.dropped == 0
-    reader.give(4)  # slow: four come meanwhile
-    number, _, pixels = newest.take()
-    assert (number, int(pixels[0, 0, 0]), newest.dropped) == (6, 7, 3)
-    newest._stop.set()
-    reader.allowed.release()
-    newest.close()
-    assert reader.closed and not newest._thread.is_alive()
+        camera.give(1)
+        assert reader.take()[0] == number
+    assert reader.dropped == 0
+    camera.give(4)  # slow: four come meanwhile
+    number, _, pixels = reader.take()
+    assert (number, int(pixels[0, 0, 0]), reader.dropped) == (6, SETTLING + 7, 3)
+    camera.allowed.release()
+    reader.close()
+    assert camera.closed and not reader._thread.is_alive()
 
 
 def test_what_the_reader_raises_reaches_who_takes():
-    reader = Scripted(OSError("unplugged"))
-    reader.allowed.release()
-    newest = streams.NewestFrame(reader)
-    with pytest.raises(OSError, match="unplugged"):
-        newest.take()
-    newest.close()
+    camera = Scripted(ArithmeticError("unforeseen"))
+    camera.allowed.release()
+    reader = LiveReader(lambda: camera)
+    with pytest.raises(ArithmeticError, match="unforeseen"):
+        reader.take()
+    reader.close()
 
 
 def test_a_recording_is_played_at_its_rate():
-    now, waits = [0.0], []
-
-    def sleep(seconds):
-        waits.append(seconds)
-        now[0] += seconds
-
-    newest = streams.NewestFrame(Frames([np.zeros((2, 2, 3), np.uint8)] * 5), 10.0, lambda: now[0], sleep)
-    newest._thread.join()
-    assert waits == pytest.approx([0.1] * 4)
-    assert newest.take()[:2] == (4, pytest.approx(0.4)) and newest.dropped == 4
-    assert newest.take() is None
-    newest.close()
+    pictures = [np.full((2, 2, 3), k, np.uint8) for k in range(5)]
+    reader = LiveReader(lambda: Played(Frames(pictures[2:]), deque(pictures[:2])))
+    reader.drop_late()
+    found = list(iter(reader.take, None))
+    assert [number for number, _, _ in found] == [int(pixels[0, 0, 0]) for _, _, pixels in found] and found[-1][0] == 4
+    assert all(time_s >= number / Frames.fps for number, time_s, _ in found) and len(found) + reader.dropped == 5
+    reader.close()
 
 
 def test_who_comes_back_to_a_stream_goes_on_with_the_next_frame(unit):

@@ -233,21 +233,22 @@ def score_pose(grid: Grid, points: Points, own_grid: Grid, own_points: Points, p
 
 def sum_residuals(grid: Grid, points: Points, pose: Array, slope_noise: float, score_only: bool = False) -> Sums:
     """Sums of one Gauss-Newton step with Cauchy's weights, and the score of the pose (4, 4), from the reference to the grid."""
-    by = tracking.alignment_sums if library() is not None else alignment_sums
-    return sums_of(by(grid.channels, points.columns, residual_limits(grid, pose, slope_noise), score_only), slope_noise)
+    found = _alignment_sums(grid.channels, points.columns, residual_limits(grid, pose, slope_noise), score_only)
+    return sums_of(found, slope_noise)
 
 
 def sum_parts(grid: Grid, points: Points, pose: Array, slope_noise: float, parts: int) -> tuple[Sums, Array, Array]:
     """:func:`sum_residuals`, and the matrices (parts, 6, 6) and right sides (parts, 6) of as many runs of pixels."""
-    limits = residual_limits(grid, pose, slope_noise)
-    if library() is not None:
-        found = tracking.part_sums(grid.channels, points.columns, parts, limits)
-    else:
-        ends = [points.number * k // parts for k in range(parts + 1)]
-        runs = [points.columns[:, first:end] for first, end in pairwise(ends)]
-        found = np.stack([alignment_sums(grid.channels, run, limits) for run in runs])
+    limits, ends = residual_limits(grid, pose, slope_noise), [points.number * k // parts for k in range(parts + 1)]
+    found = np.stack([_alignment_sums(grid.channels, points.columns[:, a:b], limits) for a, b in pairwise(ends)])
     products = found[:, :49].reshape(parts, 7, 7)
     return sums_of(found.sum(0), slope_noise), products[:, :6, :6], products[:, :6, 6]
+
+
+def _alignment_sums(channels: Tensor, columns: Tensor, limits: Array, score_only: bool = False) -> Array:
+    """:func:`alignment_sums`, in C where there is a library."""
+    by = tracking.alignment_sums if library() is not None else alignment_sums
+    return by(channels, columns, limits, score_only)
 
 
 def residual_limits(grid: Grid, pose: Array, slope_noise: float) -> Array:

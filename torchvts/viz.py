@@ -1,4 +1,4 @@
-"""Pictures of frames: depth as contours and as a shaded surface, errors, registered clouds; made without a display."""
+"""Pictures of frames: depth as contours and as a shaded surface, registered clouds; made without a display."""
 
 import math
 import textwrap
@@ -18,7 +18,6 @@ from torch import Tensor
 
 from .calibration import Press
 from .calibration.contacts import INSIDE
-from .core.checks import check_same_size
 from .core.files import write_atomically
 from .model import Calibration
 from .model.report import PressRow
@@ -266,32 +265,6 @@ def draw_surface(axes: Any, depth: Array, mm_per_pixel: float, exaggeration: flo
     axes.view_init(elev=42, azim=-65)
     axes.set_title(f"surface, height x {exaggeration:g}", fontsize=10)
     _space_labels(axes)
-
-
-def comparison_figure(
-    depth_mm: Tensor, truth_mm: Tensor, mm_per_pixel: float, title: str = "", names: tuple[str, str] = ("measured", "truth")
-) -> Figure:
-    """Depth and truth, or another depth by its name, in the same colours, and their difference in pixels of pitch, side by side."""
-    check_same_size("truth_mm", truth_mm, "depth_mm", depth_mm.shape[-2], depth_mm.shape[-1])
-    depth, truth = _plane(depth_mm), _plane(truth_mm)
-    figure = new_figure(10.5, 2.9)
-    axes = figure.subplots(1, 3)
-    span = depth_range(depth, truth)
-    step = _round_step(span[1] - span[0])
-    for panel, values, name in ((axes[0], truth, names[1]), (axes[1], depth, names[0])):
-        draw_contours(figure, panel, values, mm_per_pixel, step, span)
-        panel.set_title(f"{name}, a line every {step:g} mm", fontsize=10)
-    error = (depth - truth) / mm_per_pixel
-    most = max(float(np.abs(error).max()), 1e-6)
-    colors, norm = depth_colors(-most, most)
-    picture = axes[2].imshow(error, cmap=colors, norm=norm, extent=_extent(depth, mm_per_pixel))
-    what = "error" if names[1] == "truth" else "difference"
-    draw_bar(figure, axes[2], picture, f"{what}, px")
-    axes[2].set_title(f"{what}, px: RMS {float(np.sqrt((error**2).mean())):.4f}, largest {most:.3f}", fontsize=10)
-    _millimetres(axes[2])
-    if title:
-        figure.suptitle(title)
-    return figure
 
 
 def sheet_figure(frames: Sequence[tuple[float | str, Array]], mm_per_pixel: float, metric: bool = True) -> Figure:

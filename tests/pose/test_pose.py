@@ -9,8 +9,8 @@ import torch
 
 import torchvts as vts
 from lab import pose_accuracy as pose_bench
+from lab.rigid import invert, motion, turn_deg
 from torchvts.pose import clouds, contact_cloud, read_cloud
-from torchvts.pose.result import invert, motion, turn_deg
 from torchvts.scenes import objects
 
 PITCH = 0.125

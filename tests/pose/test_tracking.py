@@ -11,6 +11,7 @@ from conftest import without_library
 
 import torchvts as vts
 from lab import pose_accuracy, tracking
+from lab.rigid import invert, motion, turn_deg
 from torchvts.compiled import library
 from torchvts.core.frame import DepthOutput
 from torchvts.pose import tracker as tracker_module
@@ -29,7 +30,6 @@ from torchvts.pose.inverse import (
     sum_residuals,
 )
 from torchvts.pose.keyframe import KeyframeGraph, make_keyframe
-from torchvts.pose.result import invert, motion, turn_deg
 from torchvts.pose.rigid import rotation_vector
 from torchvts.pose.uncertainty import PARTS, jackknife, shared_error
 from torchvts.scenes import objects, render

@@ -388,7 +388,7 @@ def test_what_a_keyframe_knows_to_be_unknown_stays_so(name, unknown):
 
 
 @pytest.mark.parametrize("times", [(1, 3), (2, 5)])
-def test_grids_of_kernels_and_opencv_agree(times):
+def test_grids_of_kernels_and_reference_agree(times):
     if library() is None:
         pytest.skip("no compiled kernels")
     pose = objects.pose(5.0, (9.0, 6.0), 0.5, (3.0, 1.0))  # cut by the border of the image

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..core.checks import check_float_tensor, check_tensor
+from ..core.checks import check_float_tensor
 from ..core.geometry import check_rigid
 from .ambiguity import UNKNOWN_VARIANCE, free_directions, name_directions
 from .read_cloud import open3d
@@ -83,23 +83,31 @@ def register_points(
         return _refined(o3d, moving, fixed, _by_features(o3d, moving, fixed))
 
 
+def checked_cloud(name: str, points: Tensor, normals_name: str, normals: Tensor | None) -> tuple[Tensor, Tensor | None]:
+    """Points (N, 3) and normals (N, 3) in float64 on the CPU, or raise."""
+    found = []
+    for what, values in ((name, points), (normals_name, normals)):
+        if values is None:
+            continue
+        check_float_tensor(what, values)
+        if values.dim() != 2 or values.shape[1] != 3 or len(values) != len(points):
+            raise ValueError(f"{what}: expected (N, 3) of one N, got {tuple(values.shape)}")
+        if len(values) == 0:
+            raise ValueError(f"{what}: expected points, got none: no contact?")
+        found.append(values.detach().resolve_neg().cpu().double())
+        if not bool(torch.isfinite(found[-1]).all()):
+            number = int((~torch.isfinite(values)).any(1).sum())
+            raise ValueError(f"{what}: expected finite values, got {number} lines with NaN or infinity")
+    return found[0], None if normals is None else found[1]
+
+
 def _checked(name: str, points: Tensor, normals: Tensor | None) -> tuple[Tensor, Tensor | None]:
-    """Points and normals in float64 without duplicate points, or raise."""
-    check_float_tensor(name, points)
-    if points.dim() != 2 or points.shape[1] != 3:
-        raise ValueError(f"{name}: expected (N, 3), got {tuple(points.shape)}")
-    if len(points) == 0:
-        raise ValueError(f"{name}: expected points, got none: no contact?")
-    points = points.detach().resolve_neg().cpu().double()
-    if not bool(torch.isfinite(points).all()):
-        raise ValueError(f"{name}: expected finite points, got {int((~torch.isfinite(points)).any(1).sum())} with NaN or infinity")
+    """Points without duplicates, and unit normals, or raise."""
+    points, normals = checked_cloud(name, points, f"{name}_normals", normals)
     if normals is not None:
-        check_tensor(f"{name}_normals", normals)
-        if tuple(normals.shape) != tuple(points.shape):
-            raise ValueError(f"{name}_normals: expected {tuple(points.shape)} like the points, got {tuple(normals.shape)}")
-        normals = torch.nn.functional.normalize(normals.detach().cpu().double(), dim=1)
-        if not bool((normals.norm(dim=1) > 0.5).all()):  # NaN too
-            raise ValueError(f"{name}_normals: expected finite normals, got NaN, infinite or zero ones")
+        normals = torch.nn.functional.normalize(normals, dim=1)
+        if not bool((normals.norm(dim=1) > 0.5).all()):
+            raise ValueError(f"{name}_normals: expected unit normals, got some of no length")
     first = np.sort(np.unique(points.numpy(), axis=0, return_index=True)[1])
     if len(first) < LEAST_POINTS:
         raise ValueError(f"{name}: expected at least {LEAST_POINTS} distinct points, got {len(first)} of {len(points)}")

@@ -109,7 +109,7 @@ def test_what_is_unknown_keeps_its_last_value_though_motion_goes_on():
     turned = objects.pose(5.0, (0.6, 0.3)) @ invert(objects.pose(0.0))
     frame = grids(surface_of(press(ball, objects.pose(0.0, (0.6, 0.3)))), PITCH, keyframe.resolution)
     found = follow(keyframe, frame, [last, turned.numpy()])
-    assert found.agrees and found.free.shape[1] == 3
+    assert not found.misfit and found.free.shape[1] == 3
     assert float(turn_deg(torch.from_numpy(found.pose))) < 0.2
     assert found.pose[:2, 3] == pytest.approx([0.6, 0.3], abs=0.03)
 

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .ambiguity import LEAST_INFORMATION, UNKNOWN_VARIANCE, free_directions, name_directions, span
+from .ambiguity import LEAST_INFORMATION, UNKNOWN_VARIANCE, free_directions, information_of_noise, name_directions, span
 from .grids import Grids
 from .height_errors import covariance_with_heights, height_sums
 from .inverse import (
@@ -15,7 +15,6 @@ from .inverse import (
     Score,
     Sums,
     bare_points,
-    covariance_after,
     moved_by,
     refine,
     score_pose,
@@ -25,7 +24,7 @@ from .inverse import (
     sum_residuals,
 )
 from .keyframe import Keyframe
-from .rigid import Array
+from .rigid import Array, moved_covariance
 from .uncertainty import LEAST_SLOPE_NOISE, PARTS, covariance_of_slopes
 
 MOST_STEPS = 30
@@ -74,9 +73,13 @@ class Followed(NamedTuple):
     covariance: Array
 
     @property
-    def agrees(self) -> bool:
-        """Whether the frames agree well enough on a large enough part, and show any motion."""
-        return self.free.shape[1] < 6 and self.score.is_enough()
+    def misfit(self) -> str:
+        """Why the pose is none, in words; empty if the frames agree well enough on a large enough part, and show any motion."""
+        if self.score.is_enough():
+            return "the contact is too small: no motion of it is known" if self.free.shape[1] == 6 else ""
+        if self.score.is_enough(math.inf):
+            return f"nothing fits well: {self.score.share}, but all of it differs: different objects, or slopes that err by degrees"
+        return f"nothing fits: {self.score.share}: different objects, or parts of one that hardly overlap"
 
     @property
     def exact(self) -> bool:
@@ -89,15 +92,16 @@ def follow(keyframe: Keyframe, frame: Grids, starts: list[Array]) -> Followed:
 
     Motions that the contact does not determine keep their value in the first of the poses, the last one of the track.
     """
-    costs = [sum_residuals(frame.coarse, keyframe.coarse, start, SLOPE_NOISE, score_only=True).cost for start in starts]
-    best = costs.index(min(costs))
-    first = _follow_from(keyframe, frame, starts[best], starts[0])
-    if not first.agrees:
-        for start in starts[:best] + starts[best + 1 :]:
-            other = _follow_from(keyframe, frame, start, starts[0])
-            if other.agrees:
-                return other
-    return first
+
+    def cost(start: Array) -> float:
+        return sum_residuals(frame.coarse, keyframe.coarse, start, SLOPE_NOISE, score_only=True).cost
+
+    tried: list[Followed] = []
+    for start in sorted(starts, key=cost):
+        tried.append(_follow_from(keyframe, frame, start, starts[0]))
+        if not tried[-1].misfit:
+            return tried[-1]
+    return tried[0]
 
 
 def _follow_from(keyframe: Keyframe, frame: Grids, start: Array, last: Array) -> Followed:
@@ -120,7 +124,7 @@ def _follow_from(keyframe: Keyframe, frame: Grids, start: Array, last: Array) ->
         fine, both = _with_heights(fine, keyframe, frame, refined)
         step, scaled = solve_step(both), covariance_with_heights(fine, both, scaled)
     scaled[5, 5] += fine.depth_noise**2 + HEIGHT_OFFSET_MM**2
-    pose = _kept(keyframe, unknown, last, refined @ moved_by(keyframe.many, step))
+    pose, origin = _kept(keyframe, unknown, last, refined @ moved_by(keyframe.many, step)), keyframe.many.to_origin()
     return Followed(
         pose=pose,
         fine=fine,
@@ -130,7 +134,7 @@ def _follow_from(keyframe: Keyframe, frame: Grids, start: Array, last: Array) ->
         std_deg=math.degrees(math.sqrt(float(np.diag(scaled)[:3] @ keyframe.many.units[:3] ** 2))),
         std_mm=math.sqrt(float(np.trace(scaled[3:, 3:]))),
         settled=float(np.linalg.norm(by_slopes)) < SMALL_MM,
-        covariance=covariance_after(keyframe.many, pose, scaled + unknown.motions @ unknown.motions.T * UNKNOWN_VARIANCE),
+        covariance=moved_covariance(pose, origin @ (scaled + unknown.motions @ unknown.motions.T * UNKNOWN_VARIANCE) @ origin.T),
     )
 
 
@@ -179,10 +183,9 @@ def _kept(keyframe: Keyframe, unknown: _Unknown, last: Array, pose: Array) -> Ar
 def _sliding(keyframe: Keyframe, coarse: Sums) -> _Unknown:
     """Motions under which the common contact slides on itself, by its information, and those that the keyframe may roll by."""
     information = coarse.matrix * ((coarse.noise / SLOPE_NOISE) ** 2 / max(coarse.used, 1))
-    free, shifts = free_directions(information, keyframe.bias, LEAST_INFORMATION)
-    return (
-        _joined(_Unknown(free, shifts), _Unknown(keyframe.held, shifts)) if keyframe.held.shape[1] > 0 else _Unknown(free, shifts)
-    )
+    bias = information_of_noise(keyframe.resolution.noise, keyframe.grids.coarse.pitch)
+    free, shifts = free_directions(information, bias, LEAST_INFORMATION)
+    return _joined(_Unknown(free, shifts), _Unknown(keyframe.held, shifts)) if keyframe.held.size else _Unknown(free, shifts)
 
 
 def _vague(keyframe: Keyframe, some: Sums) -> _Unknown:

@@ -182,7 +182,7 @@ def _determined(points: Array, normal: Array, rmse_mm: float) -> tuple[list[str]
     middle = points - points.mean(0)
     units = np.array([1.0 / math.sqrt(float(np.square(middle).sum(1).mean()))] * 3 + [1.0] * 3)
     jacobian = np.hstack((np.cross(middle, normal), normal)) * units
-    free, shifts = free_directions(jacobian.T @ jacobian / len(jacobian), np.zeros((6, 6)), LEAST_INFORMATION)
+    free = free_directions(jacobian.T @ jacobian / len(jacobian), np.zeros((6, 6)), LEAST_INFORMATION)
     about_origin = np.hstack((np.cross(points, normal), normal))
     known = about_origin.T @ about_origin * (min(1.0, ALIKE_POINTS / len(points)) / max(rmse_mm, 1e-6) ** 2)
-    return name_directions(free, shifts), torch.from_numpy(np.linalg.inv(known + np.diag([1.0] * 3 + [0.01] * 3)))
+    return name_directions(free), torch.from_numpy(np.linalg.inv(known + np.diag([1.0] * 3 + [0.01] * 3)))

@@ -82,7 +82,7 @@ def test_a_comparison_names_what_it_compares_and_takes_one_frame():
     assert one.get_title().startswith("look-up table") and other.get_title().startswith("response")
     assert difference.get_title().startswith("difference, px")
     with pytest.raises(ValueError, match="depth: expected one frame, got"):
-        viz.depth_figure(torch.stack((frame(), frame())), PITCH)
+        viz.depth_figure(torch.stack((frame(), frame())), PITCH, torch.rand(3, 60, 80))
     with pytest.raises(ValueError, match="truth_mm: expected"):
         figures.comparison_figure(frame(), frame()[..., :-1], PITCH)
 

@@ -85,10 +85,8 @@ def register_points(
 
 def checked_cloud(name: str, points: Tensor, normals_name: str, normals: Tensor | None) -> tuple[Tensor, Tensor | None]:
     """Points (N, 3) and normals (N, 3) in float64 on the CPU, or raise."""
-    found = []
-    for what, values in ((name, points), (normals_name, normals)):
-        if values is None:
-            continue
+    found, parts = [], [(name, points)] if normals is None else [(name, points), (normals_name, normals)]
+    for what, values in parts:
         check_float_tensor(what, values)
         if values.dim() != 2 or values.shape[1] != 3 or len(values) != len(points):
             raise ValueError(f"{what}: expected (N, 3) of one N, got {tuple(values.shape)}")

@@ -180,6 +180,15 @@ def test_different_objects_do_not_fit(reference):
     assert not found.converged and not found.ambiguous and "nothing fits" in found.message
 
 
+def test_a_flat_face_shows_three_motions_and_fits_no_relief(reference):
+    face = reference._replace(**{name: torch.zeros_like(getattr(reference, name)) for name in ("depth_mm", "gradient")})
+    face = face._replace(depth_mm=face.depth_mm + 0.4, contact=torch.ones_like(face.contact))
+    found = vts.register_depth(face, face, PITCH)
+    assert found.converged and found.ambiguous == ["translation along x", "translation along y", "rotation about z"]
+    for pair in ((face, reference), (reference, face)):
+        assert not vts.register_depth(*pair, PITCH).converged
+
+
 def test_a_sequence_starts_from_the_pose_before(letters, reference, monkeypatch):
     truth = objects.pose(0.0, (0.2, -0.1), 0.45, (1.0, -0.5)) @ invert(objects.pose(5.0, (0.5, 0.3), 0.5))
     moved = frame(letters, objects.pose(5.0, (0.5, 0.3), 0.5))

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ..core.checks import check_least
 from ..core.geometry import check_rigid
-from .ambiguity import UNKNOWN_VARIANCE, motions_of, unknown_motions
+from .ambiguity import motions_of, unknown_motions
 from .follow import Followed, follow
 from .grids import DepthFrame, Grids, checked_grids, resolution_of, surface_of
 from .inverse import SLOPE_NOISE, Points, Score, bare_points, center_and_units, points_of, refine, score_pose
@@ -82,11 +82,7 @@ def register_depth(source: DepthFrame, target: DepthFrame, mm_per_pixel: float, 
     starts = [] if initial is None else [check_rigid("initial", initial).numpy()]
     if starts and not (near := follow(keyframe, frame, starts)).misfit:
         return _registration([near])
-    starts += likely_poses(keyframe, frame)
-    if not starts:
-        reason = "nothing fits: one of the contacts has no relief that could be compared"
-        spread = torch.eye(6, dtype=torch.float64) * UNKNOWN_VARIANCE
-        return Registration(torch.eye(4, dtype=torch.float64), math.inf, 0.0, False, reason, spread, [], [], 0.0)
+    starts += likely_poses(keyframe, frame) or [np.eye(4)]  # without relief no pose is more likely than another
     found = equal_poses(keyframe, frame, starts) or [follow(keyframe, frame, starts[:1])]
     row, column = frame.coarse.pixels()
     own = points_of(frame.coarse, row, column, *center_and_units(frame.coarse.points(row, column)))

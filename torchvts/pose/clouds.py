@@ -17,7 +17,7 @@ from ..core.morphology import dilate
 from . import read_cloud
 from .grids import DepthFrame, least_depth_mm, slope_noise, surface_of
 from .output_frame import SENSOR_AXES
-from .points import checked_cloud
+from .points import checked_points
 from .surface_files import write_pcd, write_ply
 
 CLOUD_SUFFIXES = (".pcd", ".ply")
@@ -81,9 +81,10 @@ def write_point_cloud(path: str | Path, points: Tensor, normals: Tensor | None =
     path = check_path("path", path)
     if path.suffix.lower() not in CLOUD_SUFFIXES:
         raise ValueError(f"{path}: expected a name ending in {' or '.join(CLOUD_SUFFIXES)}, got {path.suffix!r}")
-    places, directions = checked_cloud("points", points, "normals", normals)
+    places = checked_points("points", points).numpy()
+    directions = None if normals is None else checked_points("normals", normals, len(places)).numpy()
     write = write_ply if path.suffix.lower() == ".ply" else write_pcd
-    write(path, places.numpy(), None if directions is None else directions.numpy(), text)
+    write(path, places, directions, text)
 
 
 def read_point_cloud(path: str | Path) -> tuple[Tensor, Tensor | None]:

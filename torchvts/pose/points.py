@@ -83,27 +83,25 @@ def register_points(
         return _refined(o3d, moving, fixed, _by_features(o3d, moving, fixed))
 
 
-def checked_cloud(name: str, points: Tensor, normals_name: str, normals: Tensor | None) -> tuple[Tensor, Tensor | None]:
-    """Points (N, 3) and normals (N, 3) in float64 on the CPU, or raise."""
-    found, parts = [], [(name, points)] if normals is None else [(name, points), (normals_name, normals)]
-    for what, values in parts:
-        check_float_tensor(what, values)
-        if values.dim() != 2 or values.shape[1] != 3 or len(values) != len(points):
-            raise ValueError(f"{what}: expected (N, 3) of one N, got {tuple(values.shape)}")
-        if len(values) == 0:
-            raise ValueError(f"{what}: expected points, got none: no contact?")
-        found.append(values.detach().resolve_neg().cpu().double())
-        if not bool(torch.isfinite(found[-1]).all()):
-            number = int((~torch.isfinite(values)).any(1).sum())
-            raise ValueError(f"{what}: expected finite values, got {number} lines with NaN or infinity")
-    return found[0], None if normals is None else found[1]
+def checked_points(name: str, values: Tensor, number: int | None = None) -> Tensor:
+    """Points or normals (N, 3) in float64 on the CPU, as many as are asked for, or raise."""
+    check_float_tensor(name, values)
+    if values.dim() != 2 or values.shape[1] != 3 or number not in (None, len(values)):
+        raise ValueError(f"{name}: expected ({'N' if number is None else number}, 3), got {tuple(values.shape)}")
+    if len(values) == 0:
+        raise ValueError(f"{name}: expected points, got none: no contact?")
+    values = values.detach().resolve_neg().cpu().double()
+    if not bool(torch.isfinite(values).all()):
+        number = int((~torch.isfinite(values)).any(1).sum())
+        raise ValueError(f"{name}: expected finite values, got {number} lines with NaN or infinity")
+    return values
 
 
 def _checked(name: str, points: Tensor, normals: Tensor | None) -> tuple[Tensor, Tensor | None]:
     """Points without duplicates, and unit normals, or raise."""
-    points, normals = checked_cloud(name, points, f"{name}_normals", normals)
+    points = checked_points(name, points)
     if normals is not None:
-        normals = torch.nn.functional.normalize(normals, dim=1)
+        normals = torch.nn.functional.normalize(checked_points(f"{name}_normals", normals, len(points)), dim=1)
         if not bool((normals.norm(dim=1) > 0.5).all()):
             raise ValueError(f"{name}_normals: expected unit normals, got some of no length")
     first = np.sort(np.unique(points.numpy(), axis=0, return_index=True)[1])

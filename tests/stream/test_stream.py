@@ -654,7 +654,8 @@ def test_track_writes_a_row_for_each_frame_after_the_reference(commands):
     assert float(rows[0]["time_s"]) == pytest.approx(16 / 30, abs=1e-5)
     assert [bool(row["lost"]) for row in rows] == [k >= 25 for k in range(16, 35)]
     assert "9 frames known less well than to 1 degree and 0.15 mm" in done.stdout and {row["converged"] for row in rows} == {"0"}
-    assert re.search(r"medians: x [\d.]+, .* mm; turns about x unknown, y unknown, z unknown degrees", done.stdout), done.stdout
+    seen = r"medians: x not seen, y not seen, z [\d.]+ mm; turns about x not seen, y not seen, z not seen degrees"
+    assert re.search(seen, done.stdout), done.stdout  # the ball may have rolled, and with it the point of it that lay at the origin
     poses = np.array([[float(row[f"T{i}{j}"]) for i in range(3) for j in range(4)] for row in rows]).reshape(-1, 3, 4)
     assert np.allclose(poses[:9], np.eye(4)[:3], atol=0.1)  # mm; the ball stays where it is
     turns = poses[:, :, :3]

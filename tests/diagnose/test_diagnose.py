@@ -186,11 +186,11 @@ TRIGGERS = {
 ORDINARY = {
     "ball": lambda k: scenes.sphere_press(10.0, 1.0, **k),
     "ball aside": lambda k: scenes.sphere_press(5.0, 0.5, (8.0, -6.0), **k),
-    "cylinder": lambda k: scenes.cylinder_press(**k),
-    "cone": lambda k: scenes.cone_press(**k),
-    "sine": lambda k: scenes.sine_press(**k),
-    "punch": lambda k: scenes.punch_press(**k),
-    "letters": lambda k: scenes.letters_press(**k),
+    "cylinder": lambda k: scenes.surface(scenes.cylinder_depth(), **k),
+    "cone": lambda k: scenes.surface(scenes.cone_depth(), **k),
+    "sine": lambda k: scenes.surface(scenes.sine_depth(), **k),
+    "punch": lambda k: scenes.surface(scenes.punch_depth(), **k),
+    "letters": lambda k: scenes.surface(scenes.letters_depth(), **k),
 }
 """Drawn presses that raise no alarm."""
 

@@ -287,6 +287,20 @@ def test_real_faults_are_found(mini_presses, mini_by_prior, other_mini):
     assert "contact_in_calibration" in vts.diagnose(None, image, unit).names
 
 
+def test_a_failed_led_of_the_background_is_named_and_no_contact(mini_presses, mini_by_prior):
+    """It was a contact, whose remedy, nothing touching the skin, helps nobody; the light of the others may reach the channel."""
+    background, presses = mini_presses
+    for left, name, says in (
+        (0.0, "led_failed", "the red LED has failed"),
+        (0.1, "light_changed", "red 12%, green 100%, blue 100%"),
+    ):
+        dead = torch.cat((left * background.mean(0, keepdim=True), background[1:]))
+        for image in (dead, presses[3].image):
+            found = vts.diagnose(dead, image, mini_by_prior)
+            assert "contact_in_background" not in found.names
+            assert says in next(finding.message for finding in found if finding.name == name)
+
+
 @pytest.mark.parametrize("share", [0.12, 0.5])
 def test_a_dimmer_channel_and_a_darker_image_are_measured_and_cost_nothing(share):
     case = undisturbed(3)

@@ -36,7 +36,7 @@ MODULES = {
 RECORDS = {
     "Calibration", "CalibrationWarning", "Conditions", "ConfidentOutput", "DepthOutput", "Diagnosis", "Diagnosis.of",
     "Finding", "LightFit", "MlpFit", "Registration", "Result", "export.ExportCheck", "export.Format",
-    "gs_sdk.GsSdkFolder", "gs_sdk.GsSdkPress", "DotMotion", "Slip", "objects.Target", "scenes.Scene",
+    "gs_sdk.GsSdkPress", "DotMotion", "Slip", "objects.Target", "scenes.Scene",
     "stream.Reader", "stream.TactileFrame", "stream.Unreadable",
 }  # fmt: skip
 """Results that users get and do not make: their constructors keep what they are given. (Their methods are in the table.)"""

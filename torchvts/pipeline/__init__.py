@@ -5,7 +5,7 @@ from .conditions import UNEVEN, UNSEEN_DEG, doubts_of, light_levels, light_uneve
 from .confidence import Confidence, ConfidentOutput, ConfidentPipeline, bound_at
 from .depth import MODES, DepthPipeline
 from .frozen import FrozenPipeline
-from .refine import Refine, SlopesOfDepth, SlopesOfPixels
+from .refine import Refine
 from .shadows import Shadows
 from .solve import Solve
 from .unit import unit_pipeline
@@ -23,8 +23,6 @@ __all__ = [
     "FrozenPipeline",
     "Refine",
     "Shadows",
-    "SlopesOfDepth",
-    "SlopesOfPixels",
     "Solve",
     "bound_at",
     "doubts_of",

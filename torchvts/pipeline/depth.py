@@ -17,13 +17,13 @@ from ..core.checks import (
     check_record,
 )
 from ..core.frame import Conditions, DepthOutput, Frame, Solution
-from ..core.geometry import GradientFromNormal, normal_from_gradient
+from ..core.geometry import GradientFromNormal, gradient_of_depth, normal_from_gradient
 from ..core.settings import check_settings, settings_as_tensor
 from ..integration import PoissonDCT, WrappedIntegrator, as_integrator
 from ..model import Calibration, FillMarkers, Sensor, check_calibration
 from ..normals import NormalFromIntensity, NormalFromMLP, NormalFromResponse, WrappedNormals, as_normal_model, check_domain
 from ..skin import ContactFromDepth, ContactMask, ContactSettings, ZeroBackground, moved, unseen_deg
-from .refine import Refine, SlopesOfDepth, SlopesOfPixels
+from .refine import Refine
 from .solve import Solve
 
 if TYPE_CHECKING:
@@ -98,7 +98,7 @@ class DepthPipeline(nn.Module):
         own = isinstance(mask, ContactMask) and type(mask).forward is ContactMask.forward
         self.takes_slopes = own and model.calibrated
         self.refine: nn.Module = Refine(self.solve, model.passes if mode == "precise" and model.uses_depth else 1)
-        self.slopes = SlopesOfDepth(mm_per_pixel) if model.normals_from_depth else SlopesOfPixels()
+        self.slopes_of_depth = model.normals_from_depth
         self.contact = touching
 
     def __setattr__(self, name: str, value: Any) -> None:
@@ -224,7 +224,7 @@ class DepthPipeline(nn.Module):
         """Depth and slopes of a solution, and where the skin has moved and the object touches it."""
         deformed = moved(frame.weight.detach(), solution.depth_mm.detach())
         contact = self.contact(solution.depth_mm.detach(), deformed)
-        gradient = self.slopes(solution)
+        gradient = gradient_of_depth(solution.depth_mm, self.mm_per_pixel) if self.slopes_of_depth else solution.gradient
         return DepthOutput(solution.depth_mm, gradient, normal_from_gradient(gradient), contact, deformed)
 
     @torch.jit.unused

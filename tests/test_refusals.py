@@ -45,7 +45,7 @@ PARTS = {
     "DepthBrightness", "Integrator", "NormalModel", "Refine", "ResponseField", "ResponseModel",
     "SensorPrior", "Shadows", "Solve", "WrappedIntegrator", "WrappedNormals", "as_integrator",
     "as_normal_model", "by_presses", "channel_structure", "check_calibration", "check_domain", "check_sensor",
-    "OutputFrame.", "doubts_of", "light_levels", "light_unevenness",
+    "OutputFrame.", "doubts_of",
     "DotMotion.", "scenes.DottedSkin.", "scenes.Drag.", "motion_of_unit", "moved", "read_point_cloud", "stream.FrameCheck.",
     "stream.NewestFrame", "stream.Overlay", "stream.Recorder.", "stream.Recording.", "stream.StageClock",
     "stream.CameraSettings", "stream.Camera", "stream.Keys", "stream.LiveView", "stream.Sheet", "stream.StreamReport.",

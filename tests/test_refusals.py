@@ -43,7 +43,7 @@ RECORDS = {
 PARTS = {
     "PoseTracker", "TrackedPose",
     "DepthBrightness", "Integrator", "NormalModel", "Refine", "ResponseField", "ResponseModel",
-    "SensorPrior", "Shadows", "Solve", "WrappedIntegrator", "WrappedNormals", "as_integrator",
+    "SensorPrior", "Shadows", "Solve", "WrappedNormals",
     "as_normal_model", "by_presses", "channel_structure", "check_calibration", "check_domain", "check_sensor",
     "OutputFrame.", "doubts_of",
     "DotMotion.", "scenes.DottedSkin.", "scenes.Drag.", "motion_of_unit", "moved", "read_point_cloud", "stream.FrameCheck.",

@@ -347,7 +347,8 @@ def calibration_figure(calibration: Calibration, presses: Sequence[Press]) -> Fi
     axes[0, 0].set_title("balls found (dashed: left out)" if rows else "background", fontsize=9)
     for row in rows.values():
         _circle(axes[0, 0], row)
-    if (error := error_over_skin(calibration)) is not None:
+    if (found := error_over_skin(calibration)) is not None:
+        error, _, _ = found
         least = float(error.min())
         most = max(1.5 * least, float(error.flatten().quantile(0.9)))  # corners, where no ball fits, would take all colours
         extent = (-0.5, width - 0.5, height - 0.5, -0.5)

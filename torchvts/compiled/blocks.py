@@ -32,9 +32,6 @@ LIGHTS = 8193
 DEGREES = (2, 4, 6)
 """Degrees for which response.c has loops."""
 
-TERMS = {(False, False): 3, (True, False): 9, (False, True): 13, (True, True): 19}
-"""Terms for which it has, by whether there are products of two and of three changes."""
-
 
 class NotCompiled(Exception):
     """What has no compiled form, in words."""
@@ -232,7 +229,7 @@ def _response_values(name: str, model: NormalFromResponse) -> Values:
     by_depth = _polynomials(per_mm, place, 2)
     if field is None or by_depth is None:
         raise NotCompiled(f"{name} has maps that are no polynomials along rows")
-    check_equal(f"{name}.maps", maps.shape[0], TERMS[(model.products, model.cubic)])
+    check_equal(f"{name}.maps", maps.shape[0], len(model.terms))
     return {
         "height": int(maps.shape[2]),
         "width": int(maps.shape[3]),

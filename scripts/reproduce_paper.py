@@ -13,7 +13,7 @@ import torch
 from tqdm import tqdm
 
 import torchvts as vts
-from lab import methods, metrics, pose_accuracy
+from lab import figures, methods, metrics, pose_accuracy
 from lab.commands import main_of, parser_of
 from lab.sets import data_folder
 from lab.training import Training
@@ -55,7 +55,7 @@ def figure_4(folder: Path, out: Path) -> list[str]:
                 f"| {camera}, {case} | {paper} | {error.max_px:.2f} ({error.max_mm:.3f} mm) | {error.rms_px:.3f} "
                 f"| {found_by_paper} | {found} | {sphere} |"
             )
-            figure = viz.comparison_figure(result.depth_mm, truth, PITCH, f"figure 4: TACTO, {camera}, {case}")
+            figure = figures.comparison_figure(result.depth_mm, truth, PITCH, f"figure 4: TACTO, {camera}, {case}")
             viz.save_figure(figure, out / f"figure_4_{camera}_{case}.png")
     head = "| scene | paper, largest px | ours, largest px | RMS px | paper, sphere centre and radius mm | ours | truth |"
     return [head, "|---|---|---|---|---|---|---|", *rows]
@@ -79,7 +79,7 @@ def table_2(folder: Path, out: Path) -> list[str]:
             image_px = float(difference.square().mean().sqrt())
             contact_px = float(difference[one.contact | other.contact].square().mean().sqrt())
             rows.append((name, press.name, image_px, contact_px))
-        figure = viz.comparison_figure(
+        figure = figures.comparison_figure(
             one.depth_mm, other.depth_mm, sensor.mm_per_pixel, f"table 2: {name} and look-up table", (name, "look-up table")
         )
         viz.save_figure(figure, out / f"table_2_{name.split(',')[0].split(' (')[0].replace(' ', '_')}.png")

@@ -69,7 +69,7 @@ CAUSES = [
     ("poisson_dct", "gradient", torch.zeros(1, 2, 1, 5), "expected H and W of at least 2, got 1 x 5"),
     ("find_markers", "image", torch.zeros(1, 3, 4, 32), "expected more than 5 .* got 4 x 32"),
     ("scenes.sphere_press", "press_mm", 99.0, r"expected a number in \(0, 10\], got 99"),
-    ("scenes.letters_press", "text", "abc", "expected capital letters A-Z and spaces, got "),
+    ("scenes.letters_depth", "text", "abc", "expected capital letters A-Z and spaces, got "),
     ("Compensate", "defects", torch.ones(HEIGHT, WIDTH) > 0, "expected valid pixels"),
     ("NormalFromLookup.fit", "slope", torch.full((50, 2), torch.inf), "expected finite values.*3 pixels inside the rim"),
     ("NormalFromLookup.fit", "change", torch.zeros(50, 3), "expected colours that vary"),

@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from conftest import Frames
 from refusals_values import *
 
 import torchvts as vts
@@ -34,17 +33,17 @@ TABLE = {
         "y": [None, torch.zeros(4, 8), torch.zeros(1, 8, 8)]}),
     "scenes.sphere_press": Entry({"radius_mm": 10.0, "press_mm": 1.0, "center_mm": (0.0, 0.0), **SIZE},
         {"radius_mm": NUMBER, "press_mm": [*NUMBER, 99.0], "center_mm": CENTER, "camera_height_mm": HEIGHTS}),
-    "scenes.cylinder_press": Entry(
-        {"radius_mm": 4.0, "press_mm": 0.5, "length_mm": 9.0, "angle_deg": 25.0, "center_mm": (0.0, 0.0), **SIZE},
+    "scenes.cylinder_depth": Entry(
+        {"radius_mm": 4.0, "press_mm": 0.5, "length_mm": 9.0, "angle_deg": 25.0, "center_mm": (0.0, 0.0)},
         {"radius_mm": NUMBER, "press_mm": [*NUMBER, 99.0], "length_mm": NUMBER, "angle_deg": ["1", None, NAN], "center_mm": CENTER}
         ),
-    "scenes.cone_press": Entry({"half_angle_deg": 65.0, "press_mm": 1.0, "tip_radius_mm": 0.5, "center_mm": (0.0, 0.0), **SIZE},
+    "scenes.cone_depth": Entry({"half_angle_deg": 65.0, "press_mm": 1.0, "tip_radius_mm": 0.5, "center_mm": (0.0, 0.0)},
         {"half_angle_deg": [*NUMBER, 90.0], "press_mm": NUMBER, "tip_radius_mm": NUMBER, "center_mm": CENTER}),
-    "scenes.sine_press": Entry({"amplitude_mm": 0.1, "period_mm": 2.0, "radius_mm": 8.0, **SIZE},
+    "scenes.sine_depth": Entry({"amplitude_mm": 0.1, "period_mm": 2.0, "radius_mm": 8.0},
         {"amplitude_mm": NUMBER, "period_mm": NUMBER, "radius_mm": NUMBER}),
-    "scenes.punch_press": Entry({"radius_mm": 5.0, "press_mm": 0.6, "tilt_deg": 2.0, "wall_mm": 1.0, **SIZE},
+    "scenes.punch_depth": Entry({"radius_mm": 5.0, "press_mm": 0.6, "tilt_deg": 2.0, "wall_mm": 1.0},
         {"radius_mm": NUMBER, "press_mm": NUMBER, "tilt_deg": ["1", None, NAN], "wall_mm": NUMBER}),
-    "scenes.letters_press": Entry({"text": "VTS", "press_mm": 0.5, "size_mm": 6.0, "stroke_mm": 1.0, "bevel_mm": 0.6, **SIZE},
+    "scenes.letters_depth": Entry({"text": "VTS", "press_mm": 0.5, "size_mm": 6.0, "stroke_mm": 1.0, "bevel_mm": 0.6},
         {"text": ["", "a", None, 3], "press_mm": NUMBER, "size_mm": NUMBER, "stroke_mm": NUMBER, "bevel_mm": NUMBER}),
     "scenes.render": Entry({"scene": scene(), "lights": lights(), "noise_std": 0.01, "bits": 8, "gamma": 1.0, "vignetting": 0.1,
         "spots": torch.ones(1, 1, HEIGHT, WIDTH)}, {"scene": [None, DEPTH, "sphere"], "lights": [POSITION, None],
@@ -120,7 +119,7 @@ TABLE = {
         "sensor_or_calibration": [None, "gelsight_mini"], "mode": ["slow", None], "background_frames": INTEGER, "presses": [],
         "network": [], "device": [], "contact": ["4.5", 4.5], "record": []}, run=False),
     "stream.Recorder": Entry(
-        {"reader": Frames([]), "path": "raw"}, {"reader": [], "path": ["raw.avi", None, 2.5]}, named={"path": "record"}, run=False),
+        {"path": "raw", "fps": 30.0}, {"path": ["raw.avi", None, 2.5], "fps": []}, named={"path": "record"}, run=False),
     "stream.VideoFile": Entry(
         {"path": "film.avi", "fps": 10.0}, {"path": ["film.gif", "film"], "fps": NUMBER}, named={"path": "video"}),
     "stream.open_source": Entry({"source": ..., "reconnect_s": 0.0, "settings": vts.stream.CameraSettings()}, {

@@ -36,18 +36,18 @@ MODULES = {
 RECORDS = {
     "Calibration", "CalibrationWarning", "Conditions", "ConfidentOutput", "DepthOutput", "Diagnosis", "Diagnosis.of",
     "Finding", "LightFit", "MlpFit", "Registration", "Result", "export.ExportCheck", "export.Format",
-    "gs_sdk.GsSdkFolder", "gs_sdk.GsSdkPress", "DotMotion", "Slip", "objects.Target", "scenes.Scene",
+    "gs_sdk.GsSdkPress", "DotMotion", "Slip", "objects.Target", "scenes.Scene",
     "stream.Reader", "stream.TactileFrame", "stream.Unreadable",
 }  # fmt: skip
 """Results that users get and do not make: their constructors keep what they are given. (Their methods are in the table.)"""
 PARTS = {
     "PoseTracker", "TrackedPose",
     "DepthBrightness", "Integrator", "NormalModel", "Refine", "ResponseField", "ResponseModel",
-    "SensorPrior", "Shadows", "SlopesOfDepth", "SlopesOfPixels", "Solve", "WrappedIntegrator", "WrappedNormals", "as_integrator",
+    "SensorPrior", "Shadows", "Solve", "WrappedNormals",
     "as_normal_model", "by_presses", "channel_structure", "check_calibration", "check_domain", "check_sensor",
-    "OutputFrame.", "doubts_of", "light_levels", "light_unevenness",
+    "OutputFrame.", "doubts_of",
     "DotMotion.", "scenes.DottedSkin.", "scenes.Drag.", "motion_of_unit", "moved", "read_point_cloud", "stream.FrameCheck.",
-    "stream.NewestFrame", "stream.Overlay", "stream.Recorder.", "stream.Recording.", "stream.StageClock",
+    "stream.Overlay", "stream.Recorder.", "stream.Recording.", "stream.StageClock",
     "stream.CameraSettings", "stream.Camera", "stream.Keys", "stream.LiveView", "stream.Sheet", "stream.StreamReport.",
     "stream.TactileStream.rezero", "stream.VideoFile.", "stream.find_camera", "stream.has_screen",
     "read_result", "stream.check_device", "stream.read_background", "stream.read_press_images", "stream.require_rerun",

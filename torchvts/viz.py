@@ -1,4 +1,4 @@
-"""Pictures of frames: depth as contours and as a shaded surface, errors, registered clouds; made without a display."""
+"""Pictures of frames: depth as contours and as a shaded surface, registered clouds; made without a display."""
 
 import math
 import textwrap
@@ -18,7 +18,6 @@ from torch import Tensor
 
 from .calibration import Press
 from .calibration.contacts import INSIDE
-from .core.checks import check_same_size
 from .core.files import write_atomically
 from .model import Calibration
 from .model.report import PressRow
@@ -93,7 +92,7 @@ def depth_range(*depths: Array) -> tuple[float, float]:
 def depth_figure(
     depth_mm: Tensor,
     mm_per_pixel: float,
-    image: Tensor | None = None,
+    image: Tensor,
     contact: Tensor | None = None,
     title: str = "",
     exaggeration: float | None = None,
@@ -106,7 +105,7 @@ def depth_figure(
     Args:
         depth_mm: one frame, (1, 1, H, W) or (H, W), mm.
         mm_per_pixel: pixel pitch, mm.
-        image: (1, 3, H, W) or (3, H, W) in [0, 1]; None leaves its panel out.
+        image: (1, 3, H, W) or (3, H, W) in [0, 1].
         contact: bool, the same shape as depth.
         title: text above the panels.
         exaggeration: of the surface's heights; None takes :func:`exaggeration_of` this depth.
@@ -118,34 +117,27 @@ def depth_figure(
     title += "" if metric else ", NOT METRIC"
     ratio = depth.shape[0] / depth.shape[1]
     wide = 2.45 if ratio < 1.0 else 2.0
-    text = "\n".join("\n".join(textwrap.wrap(doubt, 75 * (2 if image is None else 3) // 2 + 40)) for doubt in doubts)
+    text = "\n".join("\n".join(textwrap.wrap(doubt, 152)) for doubt in doubts)
     above = (0.62 if title else 0.32) + (0.05 + 0.16 * (text.count("\n") + 1) if text else 0.0)
-    high, left, top = wide * ratio, 0.6, above
-    total = high + top + 0.5
-    count = 1 if image is None else 2
-    size = (left + count * (wide + 0.5) + 0.45 + 3.4, total)
+    high, left = wide * ratio, 0.6 + wide + 0.5
+    lower, size = 0.5, (left + wide + 0.95 + 3.4, high + above + 0.5)
     figure = new_figure(*size)
     figure.set_layout_engine("none")
 
     def panel(x: float, y: float, width: float, height: float, **options: Any) -> Any:
         return figure.add_axes((x / size[0], y / size[1], width / size[0], height / size[1]), **options)
 
-    lower = size[1] - top - high
-    if image is not None:
-        axes = panel(left, lower, wide, high)
-        picture = image.detach().cpu().reshape(3, *depth.shape).permute(1, 2, 0).clamp(0, 1).numpy()
-        axes.imshow(picture, extent=_extent(depth, mm_per_pixel))
-        if contact is not None and bool(contact.any()):
-            draw_outline(axes, _plane(contact.float()), mm_per_pixel)
-        if moved is not None:
-            draw_motion(axes, moved)
-        axes.set_title("image" if contact is None else "image, contact outlined", fontsize=10)
-        _millimetres(axes)
-        left += wide + 0.5
+    axes = panel(0.6, lower, wide, high)
+    axes.imshow(_picture(image.reshape(3, *depth.shape)), extent=_extent(depth, mm_per_pixel))
+    if contact is not None and bool(contact.any()):
+        draw_outline(axes, _plane(contact.float()), mm_per_pixel)
+    if moved is not None:
+        draw_motion(axes, moved)
+    axes.set_title("image" if contact is None else "image, contact outlined", fontsize=10)
+    _millimetres(axes)
     axes = panel(left, lower, wide, high)
     draw_contours(figure, axes, depth, mm_per_pixel, metric=metric)
-    if image is not None:
-        axes.set_ylabel("")
+    axes.set_ylabel("")
     space = panel(left + wide + 0.55, 0.0, size[0] - left - wide - 0.75, lower + high, projection="3d")
     draw_surface(space, depth, mm_per_pixel, exaggeration=exaggeration)
     if title:
@@ -163,14 +155,14 @@ def draw_outline(axes: Any, mask: Array, mm_per_pixel: float, color: str = "whit
     drawn.set_path_effects(_HALO)
 
 
-def draw_motion(axes: Any, moved: DotMotion, frame: int = 0) -> None:
-    """Arrows of printed dots from rest over an image in mm, in true length, and a bar of the largest one's decade.
+def draw_motion(axes: Any, moved: DotMotion) -> None:
+    """Arrows of one frame's printed dots from rest over an image in mm, in true length, and a bar of the largest one's decade.
 
     A dot that is not seen has none; a short arrow is a point.
     """
-    seen = moved.seen[frame].cpu()
+    seen = moved.seen[0].cpu()
     rest = moved.rest_mm.detach().cpu()[seen]
-    step = moved.displacement_mm[frame].detach().cpu()[seen, :2]
+    step = moved.displacement_mm[0].detach().cpu()[seen, :2]
     origin = torch.tensor([moved.width, moved.height]) * (0.5 * moved.mm_per_pixel)  # extents begin at the image's corner
     x, y = (rest + origin).T.numpy()
     axes.quiver(x, y, *step.T.numpy(), angles="xy", scale_units="xy", scale=1.0, color=SOURCE, width=0.006, minlength=0.5)
@@ -187,7 +179,6 @@ def draw_contours(
     axes: Any,
     depth: Array,
     mm_per_pixel: float,
-    step_mm: float | None = None,
     range_mm: tuple[float, float] | None = None,
     metric: bool = True,
 ) -> None:
@@ -198,14 +189,13 @@ def draw_contours(
         axes: the panel.
         depth: (H, W), mm.
         mm_per_pixel: pixel pitch, mm.
-        step_mm: distance of the lines, mm; None chooses it.
         range_mm: range of the colours, for panels that are compared; None takes that of the depth (:func:`depth_range`).
         metric: whether depth is in mm; otherwise the bar says that it is not.
     """
     low, high = range_mm or depth_range(depth)
     colors, norm = depth_colors(low, high)
     picture = axes.imshow(depth, cmap=colors, norm=norm, extent=_extent(depth, mm_per_pixel))
-    step = step_mm or _round_step(high - low)
+    step = _round_step(high - low)
     _draw_lines(axes, depth.clip(low, high), mm_per_pixel, step, colors, norm)
     draw_bar(figure, axes, picture, "depth, mm" if metric else "depth, NOT METRIC")
     axes.set_title(f"depth, a line every {step:g} mm", fontsize=10)
@@ -266,32 +256,6 @@ def draw_surface(axes: Any, depth: Array, mm_per_pixel: float, exaggeration: flo
     axes.view_init(elev=42, azim=-65)
     axes.set_title(f"surface, height x {exaggeration:g}", fontsize=10)
     _space_labels(axes)
-
-
-def comparison_figure(
-    depth_mm: Tensor, truth_mm: Tensor, mm_per_pixel: float, title: str = "", names: tuple[str, str] = ("measured", "truth")
-) -> Figure:
-    """Depth and truth, or another depth by its name, in the same colours, and their difference in pixels of pitch, side by side."""
-    check_same_size("truth_mm", truth_mm, "depth_mm", depth_mm.shape[-2], depth_mm.shape[-1])
-    depth, truth = _plane(depth_mm), _plane(truth_mm)
-    figure = new_figure(10.5, 2.9)
-    axes = figure.subplots(1, 3)
-    span = depth_range(depth, truth)
-    step = _round_step(span[1] - span[0])
-    for panel, values, name in ((axes[0], truth, names[1]), (axes[1], depth, names[0])):
-        draw_contours(figure, panel, values, mm_per_pixel, step, span)
-        panel.set_title(f"{name}, a line every {step:g} mm", fontsize=10)
-    error = (depth - truth) / mm_per_pixel
-    most = max(float(np.abs(error).max()), 1e-6)
-    colors, norm = depth_colors(-most, most)
-    picture = axes[2].imshow(error, cmap=colors, norm=norm, extent=_extent(depth, mm_per_pixel))
-    what = "error" if names[1] == "truth" else "difference"
-    draw_bar(figure, axes[2], picture, f"{what}, px")
-    axes[2].set_title(f"{what}, px: RMS {float(np.sqrt((error**2).mean())):.4f}, largest {most:.3f}", fontsize=10)
-    _millimetres(axes[2])
-    if title:
-        figure.suptitle(title)
-    return figure
 
 
 def sheet_figure(frames: Sequence[tuple[float | str, Array]], mm_per_pixel: float, metric: bool = True) -> Figure:
@@ -383,7 +347,8 @@ def calibration_figure(calibration: Calibration, presses: Sequence[Press]) -> Fi
     axes[0, 0].set_title("balls found (dashed: left out)" if rows else "background", fontsize=9)
     for row in rows.values():
         _circle(axes[0, 0], row)
-    if (error := error_over_skin(calibration)) is not None:
+    if (found := error_over_skin(calibration)) is not None:
+        error, _, _ = found
         least = float(error.min())
         most = max(1.5 * least, float(error.flatten().quantile(0.9)))  # corners, where no ball fits, would take all colours
         extent = (-0.5, width - 0.5, height - 0.5, -0.5)

@@ -15,6 +15,7 @@ from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 from torch import Tensor
 
+from torchvts.core.checks import check_same_size
 from torchvts.core.files import write_atomically
 from torchvts.pipeline import ConfidentPipeline
 from torchvts.training.balls import Truth
@@ -205,6 +206,30 @@ def set_figure(evaluation: Evaluation) -> Figure:
         draw_bar(figure, lower, lower.imshow(error.numpy(), cmap=colors, norm=norm, extent=extent), "um")
         lower.set_title(f"error of relief, RMS {float(error.square().nanmean().sqrt()):.1f} um", fontsize=9)
     figure.suptitle(f"{evaluation.data.name}, {shown.name}; contact in orange, the true one dotted", fontsize=11)
+    return figure
+
+
+def comparison_figure(
+    depth_mm: Tensor, truth_mm: Tensor, mm_per_pixel: float, title: str = "", names: tuple[str, str] = ("measured", "truth")
+) -> Figure:
+    """Depth and truth, or another depth by its name, in the same colours, and their difference in pixels of pitch, side by side."""
+    check_same_size("truth_mm", truth_mm, "depth_mm", depth_mm.shape[-2], depth_mm.shape[-1])
+    depth, truth = (one.double().numpy().reshape(one.shape[-2:]) for one in (depth_mm, truth_mm))
+    figure = new_figure(10.5, 2.9)
+    one, other, difference = figure.subplots(1, 3)
+    for panel, values, name in ((one, truth, names[1]), (other, depth, names[0])):
+        draw_contours(figure, panel, values, mm_per_pixel, range_mm=depth_range(depth, truth))
+        panel.set_title(panel.get_title().replace("depth", name, 1), fontsize=10)
+    error = (depth - truth) / mm_per_pixel
+    most = max(float(np.abs(error).max()), 1e-6)
+    colors, norm = depth_colors(-most, most)
+    picture = difference.imshow(error, cmap=colors, norm=norm, extent=(*one.get_xlim(), *one.get_ylim()))  # mm
+    what = "error" if names[1] == "truth" else "difference"
+    draw_bar(figure, difference, picture, f"{what}, px")
+    difference.set_title(f"{what}, px: RMS {float(np.sqrt((error**2).mean())):.4f}, largest {most:.3f}", fontsize=10)
+    difference.set_xlabel("x, mm")
+    if title:
+        figure.suptitle(title)
     return figure
 
 

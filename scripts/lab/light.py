@@ -18,7 +18,7 @@ from torch import Tensor
 from torchvts import Calibration, ConfidentPipeline, DepthPipeline, Press, Sensor, calibrate, diagnose, read_presses
 from torchvts.core.tables import markdown
 from torchvts.pipeline.confidence import ConfidentOutput
-from torchvts.scenes import Scene, punch_press, render, sphere_press
+from torchvts.scenes import Scene, punch_depth, render, sphere_press, surface
 from torchvts.scenes.surfaces import undeformed
 
 from . import sets
@@ -144,7 +144,7 @@ def _drawn(name: str) -> Unit:
     scenes = [sphere_press(*ball, **size) for ball in balls]
     if name == LARGE:
         scenes = [sphere_press(radius, press, **size) for radius, press in ((35.0, 1.0), (50.0, 0.75), (60.0, 0.8))]
-        scenes += [punch_press(radius, 0.6, tilt, **size) for radius, tilt in ((7.5, 2.0), (8.5, 1.0))]
+        scenes += [surface(punch_depth(radius, 0.6, tilt), **size) for radius, tilt in ((7.5, 2.0), (8.5, 1.0))]
 
     def photo(scene: Scene, seed: int) -> Tensor:
         return render(scene, lights, noise_std=NOISE_STD, bits=8, seed=seed)[0]

@@ -14,10 +14,10 @@ from torchvts.core.tables import markdown
 from torchvts.model import Calibration, PointLights, Sensor
 from torchvts.pipeline import DepthOutput, DepthPipeline, FrozenPipeline
 from torchvts.pose import Registration, register_depth
-from torchvts.pose.result import invert, turn_deg
 from torchvts.scenes import objects, render
 
 from .faults import ring_lights
+from .rigid import invert, turn_deg
 from .rows import Row
 
 GOAL_DEG, GOAL_MM = 1.0, 0.15

@@ -118,20 +118,20 @@ def _random_press(draw: random.Random, shape: str, sensor: Sensor) -> scenes.Sce
     if shape == "cylinder":
         radius = draw.uniform(0.08, 0.2) * high
         press, length = draw.uniform(0.05, 0.25) * radius, draw.uniform(0.2, 0.6) * high
-        return scenes.cylinder_press(radius, press, length, draw.uniform(0.0, 180.0), near, *size)
+        return scenes.surface(scenes.cylinder_depth(radius, press, length, draw.uniform(0.0, 180.0), near), *size)
     if shape == "cone":
         angle = draw.uniform(60.0, 80.0)
         press = draw.uniform(0.12, 0.35) * high / math.tan(math.radians(angle))
-        return scenes.cone_press(angle, press, draw.uniform(0.01, 0.05) * high, near, *size)
+        return scenes.surface(scenes.cone_depth(angle, press, draw.uniform(0.01, 0.05) * high, near), *size)
     if shape == "sine":
         period = draw.uniform(0.06, 0.2) * high
-        return scenes.sine_press(draw.uniform(0.03, 0.1) * period, period, draw.uniform(0.2, 0.42) * high, *size)
+        return scenes.surface(scenes.sine_depth(draw.uniform(0.03, 0.1) * period, period, draw.uniform(0.2, 0.42) * high), *size)
     if shape == "punch":
         radius, press = draw.uniform(0.1, 0.3) * high, draw.uniform(0.01, 0.03) * high
-        return scenes.punch_press(radius, press, draw.uniform(0.0, 4.0), draw.uniform(0.04, 0.1) * high, *size)
+        return scenes.surface(scenes.punch_depth(radius, press, draw.uniform(0.0, 4.0), draw.uniform(0.04, 0.1) * high), *size)
     press, letter = draw.uniform(0.008, 0.02) * high, draw.uniform(0.18, 0.3) * high
     stroke, bevel = draw.uniform(0.03, 0.05) * high, draw.uniform(0.02, 0.04) * high
-    return scenes.letters_press(draw.choice(["VTS", "AB", "XO", "GEL"]), press, letter, stroke, bevel, *size)
+    return scenes.surface(scenes.letters_depth(draw.choice(["VTS", "AB", "XO", "GEL"]), press, letter, stroke, bevel), *size)
 
 
 def _by_random_balls(draw: random.Random, camera: _Camera, background: Tensor, seed: int) -> Calibration:

@@ -17,13 +17,13 @@ from torchvts.integration import poisson_dst
 from torchvts.model import PointLights
 from torchvts.pipeline import DepthOutput, FrozenPipeline
 from torchvts.pose import PoseTracker, Registration
-from torchvts.pose.result import invert, turn_deg
 from torchvts.scenes import objects, render
 from torchvts.skin import ZeroBackground
 
 from .faults import gaussian_blur
 from .motions import MOTIONS, Motion
 from .pose_accuracy import GOAL_DEG, GOAL_MM, rig
+from .rigid import invert, turn_deg
 from .rows import Row
 
 Array = np.ndarray[Any, Any]

@@ -136,10 +136,10 @@ def test_a_press_that_is_no_press_and_a_spot_on_the_lens_are_no_contact_in_the_b
     background, presses = given
     noisy = background + 0.004 * torch.randn(background.shape, generator=torch.Generator().manual_seed(0))
     blank = dataclasses.replace(presses[0], image=noisy.clamp(0, 1))
-    assert sort_presses(background, [blank]).left_out == [] and beside_presses(background, [blank]) == ""
+    assert sort_presses(background, [blank])[1] == [] and beside_presses(background, [blank]) == ""
     spot = background.clone()
     spot[:, 100:112, 100:112] *= 0.8
-    assert len(sort_presses(spot, presses).kept) == 12 and beside_presses(spot, presses) == ""
+    assert len(sort_presses(spot, presses)[0]) == 12 and beside_presses(spot, presses) == ""
 
 
 def test_one_press_with_swapped_channels_is_left_out_by_name():
@@ -174,9 +174,9 @@ def test_real_presses_are_kept_and_mistakes_refused(data, name):
     else:
         background = vts.read_image(data / name / "background.png")
         presses = [vts.Press(vts.read_image(file), 6.0, file.stem) for file in sorted((data / name).glob("ball_*.png"))]
-    assert sort_presses(background, presses).left_out == []
+    assert sort_presses(background, presses)[1] == []
     for first in range(0, len(presses) - 2, 3):
-        assert len(sort_presses(background, presses[first : first + 3]).kept) == 3
+        assert len(sort_presses(background, presses[first : first + 3])[0]) == 3
         assert beside_presses(background, presses[first : first + 3]) == ""
     for change, message in MISTAKES.values():
         with pytest.raises(ValueError, match=f"^presses: .*{message}"):

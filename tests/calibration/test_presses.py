@@ -574,7 +574,11 @@ def test_few_presses_move_what_a_prior_says_of_depth_by_little(known):
 
 @pytest.mark.parametrize("count", [1, 2, pytest.param(5, marks=pytest.mark.long)])
 def test_what_is_no_ball_counts_little_and_by_a_single_press_nothing_is_metric(good, rest, count):
-    flat = vts.Press(seen_by_curve(vts.scenes.cylinder_press(3.0, 1.0, 6.0, 25.0, (1.0, -2.0), *SIZE), 40), BALL_MM, "a cylinder")
+    flat = vts.Press(
+        seen_by_curve(vts.scenes.surface(vts.scenes.cylinder_depth(3.0, 1.0, 6.0, 25.0, (1.0, -2.0)), *SIZE), 40),
+        BALL_MM,
+        "a cylinder",
+    )
     unit, said = calibrate(rest, GIVEN, [*good[:count], flat])
     (named,) = (text for text in said if text.startswith("a cylinder: "))
     assert "degrees from those of a ball of any size" in named and unit.metric == (count > 1)

@@ -1,5 +1,6 @@
 """Recordings in containers, each written by its own library: the frames are those of the same images, and depth is too."""
 
+import argparse
 import io
 import json
 import sys
@@ -13,6 +14,7 @@ from conftest import bgr, tiny_image, write_film
 
 import torchvts as vts
 from torchvts import stream as streams
+from torchvts.cli.options import split_files
 from torchvts.core.containers import _of_message
 from torchvts.core.recordings import count_frames
 from torchvts.dataset import reconstruct_dataset
@@ -187,7 +189,7 @@ def depths(unit, tmp_path_factory):
     folder, out = tmp_path_factory.mktemp("images"), tmp_path_factory.mktemp("depths")
     for k, pixels in enumerate(FRAMES):
         cv2.imwrite(str(folder / f"{k}.png"), pixels)
-    reconstruct_dataset(unit, folder, out, workers=0, pictures=False)
+    reconstruct_dataset(unit, folder, out, workers=1, pictures=False)
     return [vts.read_result(out / f"{k}.npz").depth_mm for k in range(COUNT)]
 
 
@@ -200,7 +202,7 @@ def test_frames_and_depth_are_those_of_the_same_images(write, unit, depths, tmp_
     assert all(torch.equal((image * 255).round(), (tiny_image(k) * 255).round()) for k, (_, image) in enumerate(found))
     assert all(np.array_equal(streams.open_source(path).read(), FRAMES[0]) for _ in range(2))
 
-    options = {"workers": 0, "background_frames": 0, "pictures": False}
+    options = {"workers": 1, "background_frames": 0, "pictures": False}
     report = reconstruct_dataset(unit, path, tmp_path / "out", **options)
     assert (report.rows, report.failed) == (COUNT, [])
     for k, same in enumerate(depths):
@@ -210,7 +212,11 @@ def test_frames_and_depth_are_those_of_the_same_images(write, unit, depths, tmp_
 
 def test_one_of_several_recordings_is_named(tmp_path):
     path = write_tar(tmp_path).parent
-    for read in (vts.frames, streams.open_source, count_frames):
+
+    def alone(path):
+        return split_files(argparse.Namespace(files=[str(path)], sensor=None, background=None, press=[]))
+
+    for read in (vts.frames, streams.open_source, count_frames, alone):
         with pytest.raises(ValueError, match=r"recording in a WebDataset, got 2: one of .*two\.tar/left\.png, .*two\.tar/right"):
             read(path)
         with pytest.raises(
@@ -225,7 +231,7 @@ def test_one_of_several_recordings_is_named(tmp_path):
 def test_both_recordings_of_a_container_are_reconstructed_beside_each_other(unit, tmp_path):
     np.save(tmp_path / "both.npy", BOTH[:2])
     sides = [tmp_path / "both.npy" / side for side in "01"]
-    assert reconstruct_dataset(unit, sides, tmp_path / "out", workers=0, pictures=False).rows == 4
+    assert reconstruct_dataset(unit, sides, tmp_path / "out", workers=1, pictures=False).rows == 4
     assert {file.name for file in (tmp_path / "out").glob("*.npz")} == {f"{side}_{k:06d}.npz" for side in "01" for k in range(2)}
 
 
@@ -277,7 +283,7 @@ def test_a_damaged_chunk_costs_its_own_frames_alone(unit, tmp_path):
     )
     chunk.write_bytes(chunk.read_bytes()[:20])
     out = tmp_path / "out"
-    report = reconstruct_dataset(unit, tmp_path / "day.zarr", out, workers=0, background_frames=0, pictures=False)
+    report = reconstruct_dataset(unit, tmp_path / "day.zarr", out, workers=1, background_frames=0, pictures=False)
     assert report.rows == COUNT - 2 and [name for name, _ in report.failed] == ["day_000002", "day_000003"]
     assert "cannot be read" in report.failed[0][1]
 

@@ -34,7 +34,7 @@ def source(tmp_path_factory):
 @pytest.fixture(scope="module")
 def results(unit, source, tmp_path_factory):
     out = tmp_path_factory.mktemp("results")
-    reconstruct_dataset(unit, source, out, workers=0, pictures=False, background_frames=0)
+    reconstruct_dataset(unit, source, out, workers=1, pictures=False, background_frames=0)
     return out
 
 
@@ -55,7 +55,7 @@ def test_a_frame_is_what_the_pipeline_gave(unit, source, results):
 
 
 def test_a_video_in_one_file_holds_its_frames(unit, source, results, tmp_path):
-    options = {"workers": 0, "pictures": False, "background_frames": 0, "format": "video-npz"}
+    options = {"workers": 1, "pictures": False, "background_frames": 0, "format": "video-npz"}
     reconstruct_dataset(unit, source, tmp_path, **options)
     assert sorted(path.name for path in tmp_path.glob("*.npz")) == ["0.npz", "1.npz", "2.npz", "3.npz", "4.npz", "film.npz"]
     film = vts.read_result(tmp_path / "film.npz")
@@ -75,7 +75,7 @@ def test_a_recording_as_zarr_has_a_row_for_each_frame(unit, tmp_path):
     pixels = np.stack([bgr(tiny_image(k)) for k in range(7)])[..., ::-1].copy()
     pixels[2] = 0  # a frame that cannot be used
     np.save(tmp_path / "hand.npy", pixels)
-    options = {"workers": 0, "pictures": False, "background_frames": 0}
+    options = {"workers": 1, "pictures": False, "background_frames": 0}
     reconstruct_dataset(unit, tmp_path / "hand.npy", tmp_path / "single", **options)
     for run in range(2):  # the second finds all done
         report = reconstruct_dataset(unit, tmp_path / "hand.npy", tmp_path / "out", format="video-zarr", **options)
@@ -101,12 +101,12 @@ def test_every_third_frame_of_several_inputs(unit, source, tmp_path):
     (tmp_path / "more").mkdir()
     vts.write_image(tmp_path / "more" / "0.png", tiny_image(9))
     inputs = [source / "0.png", source / "film.avi", source / "2.png", tmp_path / "more", source / "0.png"]
-    report = reconstruct_dataset(unit, inputs, tmp_path / "out", every=2, workers=0, pictures=False, format="npy")
+    report = reconstruct_dataset(unit, inputs, tmp_path / "out", every=2, workers=1, pictures=False, format="npy")
     table = (tmp_path / "out" / "frames.csv").read_text().splitlines()[1:]
     rows = [line.split(",")[0].rpartition(f"{source.name}/")[2] for line in table]
     assert rows[:1] == ["0.png"] and rows[1:5] == [f"film_{k:06d}" for k in (0, 2, 4, 6)] and rows[5].endswith("more/0.png")
     assert report.rows == len(rows) == 6
-    again = reconstruct_dataset(unit, inputs, tmp_path / "out", every=2, workers=0, pictures=False, format="npy")
+    again = reconstruct_dataset(unit, inputs, tmp_path / "out", every=2, workers=1, pictures=False, format="npy")
     assert (again.before, again.rows) == (6, 6)
 
 
@@ -230,7 +230,7 @@ def test_a_network_takes_the_models_place(unit, source, tmp_path):
     calibration = vts.Calibration.load(unit)
     vts.NormalFromMLP(HEIGHT, WIDTH, calibration.background.float(), hidden=(8, 8), seed=3).save(tmp_path / "net.safetensors")
     torch.save(vts.NormalFromMLP.load(tmp_path / "net.safetensors").gs_sdk_state(), tmp_path / "nnmodel.pth")
-    options = {"workers": 0, "pictures": False}
+    options = {"workers": 1, "pictures": False}
     for name in ("net.safetensors", "nnmodel.pth"):
         out = tmp_path / name.replace(".", "_")
         reconstruct_dataset(unit, source / "1.png", out, network=tmp_path / name, **options)

@@ -186,11 +186,11 @@ TRIGGERS = {
 ORDINARY = {
     "ball": lambda k: scenes.sphere_press(10.0, 1.0, **k),
     "ball aside": lambda k: scenes.sphere_press(5.0, 0.5, (8.0, -6.0), **k),
-    "cylinder": lambda k: scenes.cylinder_press(**k),
-    "cone": lambda k: scenes.cone_press(**k),
-    "sine": lambda k: scenes.sine_press(**k),
-    "punch": lambda k: scenes.punch_press(**k),
-    "letters": lambda k: scenes.letters_press(**k),
+    "cylinder": lambda k: scenes.surface(scenes.cylinder_depth(), **k),
+    "cone": lambda k: scenes.surface(scenes.cone_depth(), **k),
+    "sine": lambda k: scenes.surface(scenes.sine_depth(), **k),
+    "punch": lambda k: scenes.surface(scenes.punch_depth(), **k),
+    "letters": lambda k: scenes.surface(scenes.letters_depth(), **k),
 }
 """Drawn presses that raise no alarm."""
 
@@ -285,6 +285,20 @@ def test_real_faults_are_found(mini_presses, mini_by_prior, other_mini):
     with pytest.warns(vts.CalibrationWarning, match="contact in the calibration image"):
         unit = vts.calibrate(mini_presses[1][20].image, vts.Sensor.load("gelsight_mini"))
     assert "contact_in_calibration" in vts.diagnose(None, image, unit).names
+
+
+def test_a_failed_led_of_the_background_is_named_and_no_contact(mini_presses, mini_by_prior):
+    """It was a contact, whose remedy, nothing touching the skin, helps nobody; the light of the others may reach the channel."""
+    background, presses = mini_presses
+    for left, name, says in (
+        (0.0, "led_failed", "the red LED has failed"),
+        (0.1, "light_changed", "red 12%, green 100%, blue 100%"),
+    ):
+        dead = torch.cat((left * background.mean(0, keepdim=True), background[1:]))
+        for image in (dead, presses[3].image):
+            found = vts.diagnose(dead, image, mini_by_prior)
+            assert "contact_in_background" not in found.names
+            assert says in next(finding.message for finding in found if finding.name == name)
 
 
 @pytest.mark.parametrize("share", [0.12, 0.5])

@@ -54,9 +54,9 @@ CLIFFS = {
 SMOOTH = {
     "sphere": lambda: scenes.sphere_press(10.0, 2.0, (0, 0), *SIZE, PITCH, torch.float64),
     "sphere cut by the border": lambda: scenes.sphere_press(10.0, 1.0, (19.0, -13.0), *SIZE, PITCH, torch.float64),
-    "sine": lambda: scenes.sine_press(0.2, 4.0, 9.0, *SIZE, PITCH, torch.float64),
-    "capsule": lambda: scenes.cylinder_press(height=120, width=160, mm_per_pixel=PITCH, dtype=torch.float64),
-    "cone": lambda: scenes.cone_press(height=120, width=160, mm_per_pixel=PITCH, dtype=torch.float64),
+    "sine": lambda: scenes.surface(scenes.sine_depth(0.2, 4.0, 9.0), *SIZE, PITCH, torch.float64),
+    "capsule": lambda: scenes.surface(scenes.cylinder_depth(), height=120, width=160, mm_per_pixel=PITCH, dtype=torch.float64),
+    "cone": lambda: scenes.surface(scenes.cone_depth(), height=120, width=160, mm_per_pixel=PITCH, dtype=torch.float64),
 }
 every_cliff = pytest.mark.parametrize("name", CLIFFS)
 every_smooth = pytest.mark.parametrize("name", SMOOTH)

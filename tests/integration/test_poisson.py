@@ -87,7 +87,7 @@ def test_order_of_convergence_is_two(solver, shape, sizes):
 
 
 def test_rest_equals_the_zero_border_for_a_contact_inside():
-    scene = vts.scenes.sine_press(height=120, width=160, mm_per_pixel=0.25, dtype=torch.float64)
+    scene = vts.scenes.surface(vts.scenes.sine_depth(), height=120, width=160, mm_per_pixel=0.25, dtype=torch.float64)
     rest, zero = vts.poisson_background(scene.gradient, 0.25), vts.poisson_dst(scene.gradient, 0.25)
     assert (rest - zero).abs().max() < 1e-4 * scene.depth_mm.max()
     assert rest[~scene.contact].mean().abs() < 1e-14

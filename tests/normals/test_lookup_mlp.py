@@ -412,18 +412,18 @@ def real_presses(folder, blur_px):
     def smooth(image):
         return kornia.filters.gaussian_blur2d(image[None], (7, 7), (blur_px, blur_px))[0] if blur_px else image
 
-    read, labels, presses = read_calibration_folder(folder), read_labels(folder), []
-    for press in read.presses:
+    (background, pressed), labels, presses = read_calibration_folder(folder), read_labels(folder), []
+    for press in pressed:
         cx, cy, contact_px = labels[press.name]
         if contact_px is None:
             continue
         ball_px = 0.5 * press.ball_diameter_mm / 0.0634
-        y, x = torch.meshgrid(torch.arange(press.height) - cy, torch.arange(press.width) - cx, indexing="ij")
+        y, x = torch.meshgrid(torch.arange(press.image.shape[1]) - cy, torch.arange(press.image.shape[2]) - cx, indexing="ij")
         squared = x * x + y * y
         inside = squared < (contact_px - 3.0) ** 2
         slope = -torch.stack((x, y)) / (ball_px**2 - squared).clamp_min(1.0).sqrt()
-        presses.append((smooth(press.image()), inside, slope))
-    return smooth(read.background), presses
+        presses.append((smooth(press.image), inside, slope))
+    return smooth(background), presses
 
 
 RAW, BLURRED = (0.0, 3.6), (1.0, 2.9)  # blur in pixels, and largest error of gs_sdk's network in degrees

@@ -127,7 +127,12 @@ def test_of_two_slopes_that_fit_where_a_light_is_blocked_the_right_one_is_taken(
 def test_walls_beyond_the_plane_of_the_lit_lights_are_found(ring, radius_mm, press_mm, tilt_deg):
     """Of a punch with a flat top, whose foot lies beyond the plane, where no start near the shallow slope leads: it left 0.9."""
     lights = ring(31.0, 18.0, rotation_deg=42.0, level=0.21)
-    assert share_of_the_plain_inverse(lights, scenes.punch_press(radius_mm, press_mm, tilt_deg, 1.1, 480, 640, PITCH), 0.003) < 0.2
+    assert (
+        share_of_the_plain_inverse(
+            lights, scenes.surface(scenes.punch_depth(radius_mm, press_mm, tilt_deg, 1.1), 480, 640, PITCH), 0.003
+        )
+        < 0.2
+    )
 
 
 def low_rig(scene, seed=0):
@@ -147,7 +152,9 @@ def test_a_cast_shadow_is_no_contact_and_no_slope(shape):
     """Of the skin behind, which is undeformed; before, it was called contact, and the depth was 3 to 8 times as wrong."""
     size = (240, 320, 0.0625)
     scene = (
-        scenes.sphere_press(6.0, 1.5, (0.5, -0.4), *size) if shape == "ball" else scenes.cone_press(50.0, 1.5, 0.5, (0, 0), *size)
+        scenes.sphere_press(6.0, 1.5, (0.5, -0.4), *size)
+        if shape == "ball"
+        else scenes.surface(scenes.cone_depth(50.0, 1.5, 0.5, (0, 0)), *size)
     )
     pipe, camera = low_rig(scene)
     plain, shadowed = pipe(camera(False)), pipe(camera(True))
@@ -205,7 +212,7 @@ def test_leds_that_have_dimmed_change_nothing(ring, small_sensor, small_press, f
 
 @pytest.mark.parametrize("radius_mm, press_mm", [(8.0, 1.0), (12.0, 2.0)])
 def test_a_tilted_punch_larger_than_half_of_the_image_is_no_other_light(ring, small_sensor, radius_mm, press_mm):
-    lights, scene = ring(), scenes.punch_press(radius_mm, press_mm, 2.0, 1.0, 120, 160, 0.25)
+    lights, scene = ring(), scenes.surface(scenes.punch_depth(radius_mm, press_mm, 2.0, 1.0), 120, 160, 0.25)
     rest = scenes.render(scenes.undeformed(scene), lights, noise_std=0.004, bits=8, seed=1)[0]
     calibration = vts.Calibration.from_lights(lights, small_sensor, rest)
     image = scenes.render(scene, lights, noise_std=0.004, bits=8, seed=2)

@@ -11,8 +11,8 @@ import torch
 from conftest import TINY_SENSOR, bgr, tiny_image
 
 import torchvts as vts
+from lab.rigid import motion
 from torchvts.pose import OutputFrame
-from torchvts.pose.result import motion
 
 MOUNT = motion(torch.tensor([0.8, -0.5, 1.5, 40.0, -20.0, 120.0], dtype=torch.float64))
 """Sensor to robot, mm."""

@@ -9,8 +9,8 @@ import torch
 
 import torchvts as vts
 from lab import pose_accuracy as pose_bench
+from lab.rigid import invert, motion, turn_deg
 from torchvts.pose import clouds, contact_cloud, read_cloud
-from torchvts.pose.result import invert, motion, turn_deg
 from torchvts.scenes import objects
 
 PITCH = 0.125
@@ -178,6 +178,15 @@ def test_different_objects_do_not_fit(reference):
     other = frame(objects.TARGETS["gear"].height_mm, objects.pose(20.0, (0.5, 0.0), 0.5))
     found = vts.register_depth(other, reference, PITCH)
     assert not found.converged and not found.ambiguous and "nothing fits" in found.message
+
+
+def test_a_flat_face_shows_three_motions_and_fits_no_relief(reference):
+    face = reference._replace(**{name: torch.zeros_like(getattr(reference, name)) for name in ("depth_mm", "gradient")})
+    face = face._replace(depth_mm=face.depth_mm + 0.4, contact=torch.ones_like(face.contact))
+    found = vts.register_depth(face, face, PITCH)
+    assert found.converged and found.ambiguous == ["translation along x", "translation along y", "rotation about z"]
+    for pair in ((face, reference), (reference, face)):
+        assert not vts.register_depth(*pair, PITCH).converged
 
 
 def test_a_sequence_starts_from_the_pose_before(letters, reference, monkeypatch):

@@ -12,7 +12,7 @@ from torchvts.core.geometry import gradient_of_depth
 from torchvts.model.markers import FillMarkers, find_dots
 from torchvts.pose import PoseTracker
 from torchvts.pose.dots import carried, fused
-from torchvts.pose.rigid import inverted, rigid_motion
+from torchvts.pose.rigid import rigid_motion
 from torchvts.scenes import DottedSkin
 from torchvts.skin import SkinMotion
 
@@ -56,7 +56,7 @@ class Roll:
 
 def errors(found, true, start):
     """Degrees, and mm at the axis."""
-    off = found.T_target_source.numpy() @ inverted(true)
+    off = found.T_target_source.numpy() @ np.linalg.inv(true)
     axis = np.array([start.x, 0.0, AXIS_Z, 1.0])
     degrees = math.degrees(math.acos(min(1.0, 0.5 * (np.trace(off[:3, :3]) - 1.0))))
     return degrees, float(np.linalg.norm(found.T_target_source.numpy() @ axis - true @ axis))

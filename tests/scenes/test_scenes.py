@@ -13,11 +13,11 @@ scenes = vts.scenes
 SIZE = {"height": 241, "width": 321, "mm_per_pixel": 0.125, "dtype": torch.float64}
 PRESSES = {
     "sphere": lambda **size: scenes.sphere_press(10.0, 1.0, (2.0, -1.0), **size),
-    "cylinder": lambda **size: scenes.cylinder_press(**size),
-    "cone": lambda **size: scenes.cone_press(**size),
-    "sine": lambda **size: scenes.sine_press(**size),
-    "punch": lambda **size: scenes.punch_press(**size),
-    "letters": lambda **size: scenes.letters_press("VTS", **size),
+    "cylinder": lambda **size: scenes.surface(scenes.cylinder_depth(), **size),
+    "cone": lambda **size: scenes.surface(scenes.cone_depth(), **size),
+    "sine": lambda **size: scenes.surface(scenes.sine_depth(), **size),
+    "punch": lambda **size: scenes.surface(scenes.punch_depth(), **size),
+    "letters": lambda **size: scenes.surface(scenes.letters_depth("VTS"), **size),
 }
 
 
@@ -63,14 +63,15 @@ def test_size_and_depth_of_presses(name, largest_mm, area_mm2):
 
 
 def test_a_cylinder_turns_from_x_towards_y():
-    scene = scenes.cylinder_press(angle_deg=45.0, **SIZE)
+    scene = scenes.surface(scenes.cylinder_depth(angle_deg=45.0), **SIZE)
     rows, columns = torch.nonzero(scene.contact[0, 0], as_tuple=True)
     assert float(torch.corrcoef(torch.stack((rows, columns)).double())[0, 1]) > 0.8
 
 
 def test_every_letter_has_its_own_shape():
     shapes = {
-        bytes(scenes.letters_press(c, height=64, width=64, mm_per_pixel=0.15).contact.numpy()) for c in "ABCDEFGHIJKLMNOPQRSTUVWXYZ"
+        bytes(scenes.surface(scenes.letters_depth(c), height=64, width=64, mm_per_pixel=0.15).contact.numpy())
+        for c in "ABCDEFGHIJKLMNOPQRSTUVWXYZ"
     }
     assert len(shapes) == 26
 

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from torchvts import Calibration, ContactFromDepth, ContactMask, DepthPipeline, PointLights, Sensor, near_field_shading
-from torchvts.scenes import hanging_skin, letters_press, render, sphere_press
+from torchvts.scenes import hanging_skin, letters_depth, render, sphere_press, surface
 from torchvts.skin import ZeroBackground, moved
 from torchvts.skin.weight import spread_of
 
@@ -148,7 +148,7 @@ def test_frames_show_how_their_skin_decays(reach_mm):
 
 def test_where_nothing_decays_all_depth_is_contact():
     """Any L takes the rims of letters off."""
-    letters = letters_press("XO", 4.0, 0.3, height=120, width=160, mm_per_pixel=0.0625)
+    letters = surface(letters_depth("XO", 4.0, 0.3), height=120, width=160, mm_per_pixel=0.0625)
     assert torch.equal(ContactFromDepth(0.0625, 0.9, 0.0)(letters.depth_mm, letters.contact), letters.contact)
 
 

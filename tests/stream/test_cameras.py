@@ -67,25 +67,30 @@ def test_a_camera_that_stops_is_no_end_of_a_video(then, reason):
 
 
 def test_a_camera_that_hangs_has_stopped():
-    camera = Camera(1, "hang")
+    camera = Camera(SETTLING + 1, "hang")
     reader = LiveReader(lambda: camera)
     assert reader.read().shape == (HEIGHT, WIDTH, 3)
     reader.silent_s = 0.1
     with pytest.raises(OSError, match=r"source: made up has stopped: no frame for 0\.1 s"):
         reader.read()
+    assert not camera.closed  # nobody can
     camera.unplugged.set()
     reader.close()
+    assert camera.closed and reader.read() is None
 
 
 def test_a_camera_that_hangs_can_be_closed():
     """Who waits for its next frame, here a thread, is told at once, not when it has been silent for long."""
-    camera = Camera(1, "hang")
+    camera = Camera(SETTLING + 1, "hang")
     reader = LiveReader(lambda: camera)
     reader.silent_s = 3600.0
-    newest = streams.NewestFrame(reader)
-    assert newest.take()[2].shape == (HEIGHT, WIDTH, 3)
-    newest.close()
-    assert newest.take() is None
+    assert reader.read().shape == (HEIGHT, WIDTH, 3)
+    found = []
+    waiting = threading.Thread(target=lambda: found.append(reader.read()))
+    waiting.start()
+    reader.close()
+    waiting.join()
+    assert found == [None]
     camera.unplugged.set()
 
 
@@ -93,18 +98,17 @@ def test_a_camera_comes_back():
     opened = []
 
     def plug():
-        opened.append(Camera((2, 0, 9, 0)[len(opened)]))
+        opened.append(Camera((SETTLING + 2, 0, SETTLING + 4)[len(opened)]))
         if len(opened) == 2:
             raise OSError("not there yet")
         return opened[-1]
 
-    reader = LiveReader(plug, reconnect_s=600.0, sleep=lambda seconds: None)
-    frames = [reader.read() for _ in range(6)]  # two, then 9 without the first 5
-    assert all(frame.shape == (HEIGHT, WIDTH, 3) for frame in frames) and reader.reconnections == 1
-    opened += [None] * 9
-    with pytest.raises(OSError, match=r"has stopped \(it gives no more frames\) and did not come back within 0\.2 s"):
-        LiveReader(lambda: Camera(0), reconnect_s=0.2, sleep=time.sleep).read()
+    reader = LiveReader(plug, reconnect_s=600.0)
+    numbers = [reader.take()[0] for _ in range(6)]
+    assert numbers == [0, 1, 2, 3, 4, 5] and reader.reconnections == 1
     reader.close()
+    with pytest.raises(OSError, match=r"has stopped \(it gives no more frames\) and did not come back within 0\.2 s"):
+        LiveReader(lambda: Camera(0), reconnect_s=0.2).read()
     with pytest.raises(ValueError, match="reconnect_s: expected 0 with a reader of your own"):
         streams.TactileStream(Camera(9), unit(), reconnect_s=1.0)
 
@@ -136,17 +140,25 @@ class Playing(Frames):
         return found
 
 
+def record(pictures, path):
+    """Record pictures that come at uneven times."""
+    recorder, camera = streams.Recorder(path, 30.0), Playing(pictures)
+    try:
+        while (picture := camera.read()) is not None:
+            recorder.add(picture)
+    finally:
+        recorder.close()
+    return recorder
+
+
 @pytest.mark.parametrize("name, kind", [("raw.mkv", np.uint8), ("raw", np.uint8), ("run.2", np.uint16)])
 def test_what_a_camera_gave_is_read_again_bit_for_bit_with_its_times(tmp_path, name, kind):
-    noise = np.random.default_rng(0).integers(0, np.iinfo(kind).max, (SETTLING + 12, 48, 64, 3), kind, endpoint=True)
-    recorder = streams.Recorder(Playing(noise), tmp_path / name)
-    while recorder.read() is not None:
-        pass
-    recorder.close()
+    noise = np.random.default_rng(0).integers(0, np.iinfo(kind).max, (12, 48, 64, 3), kind, endpoint=True)
+    recorder = record(noise, tmp_path / name)
     recorder.close()
     reader = streams.open_source(tmp_path / name)
     back = [reader.read() for _ in range(12)]
-    assert reader.read() is None and np.array_equal(back, noise[SETTLING:])
+    assert reader.read() is None and np.array_equal(back, noise)
     assert len(reader.times) == 12 and reader.times == pytest.approx(recorder.times, abs=1e-6)
     assert np.ptp(np.diff(reader.times)) > 0.005 and reader.fps == pytest.approx(11 / recorder.times[-1], rel=1e-3)
     times_file(tmp_path / name).write_text("frame,time_s\n000000,0.5\n000001,0.2\n")
@@ -178,52 +190,37 @@ def test_what_cannot_be_recorded_is_refused(tmp_path):
     with pytest.raises(ValueError, match=r"used\.mkv: expected a new name, got a file that is there already"):
         streams.TactileStream(Playing([]), unit(), record=tmp_path / "used.mkv")
     assert (tmp_path / "used.mkv").read_text() == "an earlier recording"
-    odd = streams.Recorder(Playing(np.zeros((SETTLING + 1, 47, 64, 3), np.uint8)), tmp_path / "odd.mkv")
     with pytest.raises(ValueError, match=r"expected 8 bits and an even size for .mkv, got uint8 \(47, 64\): name a folder"):
-        while odd.read() is not None:
-            pass
-    odd.close()
+        record(np.zeros((1, 47, 64, 3), np.uint8), tmp_path / "odd.mkv")
     assert not (tmp_path / "odd.mkv").exists()
 
 
 @pytest.mark.parametrize("name", ["raw.mkv", "raw"])
 def test_a_recording_that_does_not_fit_on_the_disk_is_an_error(tmp_path, name, small_files):
-    noise = np.random.default_rng(0).integers(0, 255, (SETTLING + 20, 48, 64, 3), dtype=np.uint8)
-    recorder = streams.Recorder(Playing(noise), tmp_path / name)
+    noise = np.random.default_rng(0).integers(0, 255, (20, 48, 64, 3), dtype=np.uint8)
     with small_files(8192), pytest.raises(OSError, match="cannot be written: "):
-        while recorder.read() is not None:
-            pass
-        recorder.close()
+        record(noise, tmp_path / name)
 
 
 def test_what_can_be_read_of_a_recording_on_a_full_disk_is_kept_with_its_times(tmp_path, small_files):
-    noise = np.random.default_rng(0).integers(0, 255, (SETTLING + 40, 48, 64, 3), dtype=np.uint8)
-    recorder = streams.Recorder(Playing(noise), tmp_path / "raw.mkv")
+    noise = np.random.default_rng(0).integers(0, 255, (40, 48, 64, 3), dtype=np.uint8)
     with small_files(150_000), pytest.raises(OSError, match="of 40 frames can be read back and are kept: is the disk full"):
-        while recorder.read() is not None:
-            pass
-        recorder.close()
+        record(noise, tmp_path / "raw.mkv")
     reader = streams.open_source(tmp_path / "raw.mkv")
-    assert np.array_equal(reader.read(), noise[SETTLING]) and len(reader.times) == 40
+    assert np.array_equal(reader.read(), noise[0]) and len(reader.times) == 40
 
 
 def test_on_a_full_disk_both_what_is_kept_and_what_is_lost_are_said(tmp_path, small_files):
-    noise = np.random.default_rng(0).integers(0, 255, (SETTLING + 40, 48, 64, 3), dtype=np.uint8)
+    noise = np.random.default_rng(0).integers(0, 255, (40, 48, 64, 3), dtype=np.uint8)
     times_file(tmp_path / "raw.mkv").mkdir()
-    recorder = streams.Recorder(Playing(noise), tmp_path / "raw.mkv")
     with small_files(150_000), pytest.raises(OSError, match=r"of 40 frames can be read back and are kept: .*; .*times.csv"):
-        while recorder.read() is not None:
-            pass
-        recorder.close()
+        record(noise, tmp_path / "raw.mkv")
 
 
 def test_recordings_of_several_sensors_have_one_clock(tmp_path):
     begun = time.time()
     for name in ("left.mkv", "right"):
-        recorder = streams.Recorder(Playing([picture()] * (SETTLING + 3)), tmp_path / name)
-        while recorder.read() is not None:
-            pass
-        recorder.close()
+        record([picture()] * 3, tmp_path / name)
     left, right = (
         [[float(v) for v in line.split(",")] for line in times_file(tmp_path / name).read_text().split()[1:]]
         for name in ("left.mkv", "right")

@@ -5,6 +5,7 @@ import pytest
 import torch
 
 import torchvts as vts
+from lab import figures
 from torchvts import viz
 
 PITCH = 0.1
@@ -46,7 +47,7 @@ def test_zero_keeps_its_colour_and_equal_depths_are_equally_far_from_it():
 
 
 def test_panels_that_are_compared_share_their_range():
-    truth, measured, error, *_ = viz.comparison_figure(frame() - 0.05, frame(), PITCH).axes
+    truth, measured, error, *_ = figures.comparison_figure(frame() - 0.05, frame(), PITCH).axes
     assert truth.get_images()[0].get_clim() == measured.get_images()[0].get_clim() == pytest.approx((-0.05, 0.5), abs=1e-3)
     low, high = error.get_images()[0].get_clim()
     assert low == pytest.approx(-high)
@@ -77,13 +78,13 @@ def test_a_pose_is_shown_before_and_after_at_one_scale():
 
 
 def test_a_comparison_names_what_it_compares_and_takes_one_frame():
-    one, other, difference, *_ = viz.comparison_figure(frame() - 0.05, frame(), PITCH, names=("response", "look-up table")).axes
+    one, other, difference, *_ = figures.comparison_figure(frame() - 0.05, frame(), PITCH, names=("response", "look-up table")).axes
     assert one.get_title().startswith("look-up table") and other.get_title().startswith("response")
     assert difference.get_title().startswith("difference, px")
     with pytest.raises(ValueError, match="depth: expected one frame, got"):
-        viz.comparison_figure(torch.stack((frame(), frame())), frame(), PITCH)
+        viz.depth_figure(torch.stack((frame(), frame())), PITCH, torch.rand(3, 60, 80))
     with pytest.raises(ValueError, match="truth_mm: expected"):
-        viz.comparison_figure(frame(), frame()[..., :-1], PITCH)
+        figures.comparison_figure(frame(), frame()[..., :-1], PITCH)
 
 
 def test_arrows_of_dots_have_their_true_length():

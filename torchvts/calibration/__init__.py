@@ -1,18 +1,15 @@
 """Offline calibration: from images of a unit to its Calibration."""
 
-from .by_lights import GIVEN_MISFIT
 from .contacts import ROUGH, channel_structure
 from .doubts import CalibrationWarning
-from .lights import POORLY_CONSTRAINED_DEG, LightFit, fit_lights
+from .lights import LightFit, fit_lights
 from .outliers import LEAST_WEIGHT
 from .press_model import RESPONSE_BLUR_PX, by_presses, with_preprocessing
 from .presses import Press, read_presses
 from .unit import calibrate
 
 __all__ = [
-    "GIVEN_MISFIT",
     "LEAST_WEIGHT",
-    "POORLY_CONSTRAINED_DEG",
     "RESPONSE_BLUR_PX",
     "ROUGH",
     "CalibrationWarning",

@@ -75,10 +75,7 @@ class BackgroundPixels(NamedTuple):
         return (self.model(parameter) - self.image) / self.noise[:, None]
 
     def linearised(self, parameter: Tensor) -> tuple[Tensor, Tensor]:
-        """Residuals (3, N), and their derivatives (3, K, N) in the lights (3, K): those of :meth:`model`, by hand.
-
-        Forward-mode derivatives are the same to rounding and take five times as long.
-        """
+        """Residuals (3, N), and their derivatives (3, K, N) in the lights (3, K): those of :meth:`model`, by hand."""
         value = self.model(parameter)
         a, b, z = parameter[:, 0:1], parameter[:, 1:2], parameter[:, 2:3].exp()
         x, y = self.x - a, self.y - b

@@ -71,34 +71,15 @@ def by_lights(background: Tensor, sensor: Sensor, progress: bool = False) -> tup
 
 
 def _fit(background: Tensor, sensor: Sensor, progress: bool) -> tuple[LightFit, Sensor]:
-    """Lights, and the sensor with the gamma that they were fitted with: a sparse image shows it where it is left open."""
+    """Lights, and the sensor with the gamma that they were fitted with: the image shows it where the sensor leaves it open."""
     linear = dataclasses.replace(sensor, gamma=sensor.exponent, prior=None)
-    if sensor.gamma is None:
-        sparse, small = _sparse(background, linear, 60)
-        fit = fit_lights(sparse, small, progress=progress)
-        if float(fit.misfit.max()) > NOTHING_LEFT:
-            other = fit_lights(sparse, dataclasses.replace(small, gamma=OTHER_GAMMA), progress=progress)
-            if other.converged and other.loss_history[-1] < 0.5 * fit.loss_history[-1]:
-                linear = dataclasses.replace(linear, gamma=OTHER_GAMMA)
-    return fit_lights(background, linear, progress=progress), linear
-
-
-def _sparse(background: Tensor, sensor: Sensor, rows: int) -> tuple[Tensor, Sensor]:
-    """Rows and columns at an odd stride, about ``rows`` rows, with the image centre kept in the middle."""
-    stride = max(1, min(sensor.height, sensor.width) // rows) // 2 * 2 + 1
-    row, column = _evenly(sensor.height, stride), _evenly(sensor.width, stride)
-    pitch = stride * sensor.mm_per_pixel
-    small = dataclasses.replace(
-        sensor, height=len(row), width=len(column), mm_per_pixel=pitch, corners_px=None, roi_px=None, raw_size_px=()
-    )
-    return background[:, row[:, None], column[None, :]], small
-
-
-def _evenly(size: int, stride: int) -> Tensor:
-    """Every stride-th index, with equal margins at both ends."""
-    steps = (size - 1) // stride
-    steps -= (size - 1 - steps * stride) % 2
-    return (size - 1 - steps * stride) // 2 + stride * torch.arange(steps + 1)
+    fit = fit_lights(background, linear, progress=progress)
+    if sensor.gamma is None and float(fit.misfit.max()) > NOTHING_LEFT:
+        curved = dataclasses.replace(linear, gamma=OTHER_GAMMA)
+        other = fit_lights(background, curved, progress=progress)
+        if other.converged and other.loss_history[-1] < 0.5 * fit.loss_history[-1]:
+            return other, curved
+    return fit, linear
 
 
 def _given(

@@ -123,11 +123,6 @@ def used(contacts: Sequence[Contact]) -> list[Contact]:
     return [contact for contact in contacts if not contact.reason]
 
 
-def unit_without_model(background: Tensor, sensor: Sensor) -> Calibration:
-    """The unit before its response is known: its background in linear light, blurred and cleaned as frames are."""
-    return Calibration.from_response(ResponseModel.zero(sensor.exponent, sensor.blur_px), sensor, background.double())
-
-
 def read_contacts(given: Sequence[Press], background: Tensor, sensor: Sensor) -> list[Contact]:
     """The contacts of presses, as the pipeline sees them. Those that show no contact carry a reason.
 
@@ -136,7 +131,8 @@ def read_contacts(given: Sequence[Press], background: Tensor, sensor: Sensor) ->
         background: (3, H, W) in [0, 1].
         sensor: of the unit, with the gamma and blur of the preprocessing.
     """
-    unit = unit_without_model(background, sensor)
+    before = ResponseModel.zero(sensor.exponent, sensor.blur_px)  # its response is not known yet
+    unit = Calibration.from_response(before, sensor, background.double())
     # in single precision, as frames are: 8 bits are a thousand times as coarse, and the compiled kernels take a tenth of the time
     compensate = Compensate.from_calibration(unit).float()
     noise = unit.compensated_noise_std.clamp_min(LIGHT_DRIFT).float()
@@ -222,18 +218,10 @@ def channel_structure(image: Tensor) -> float:
     height): 0.01 to 0.03 for the backgrounds of most sensors, 0.10 for a Wedge, whose LEDs are in the image; 0.06 to 0.36 under
     clear contact.
     """
-    inner = without_margin(channel_band(image, 120, image.shape[1])[0])
-    return float(inner.square().sum(0).sqrt().flatten().quantile(0.99))
-
-
-def channel_band(image: Tensor, cells: int, side_px: int) -> Tensor:
-    """Log ratios of the channels of an image (3, H, W), band-passed by Gaussians of 1/40 and 1/16 of a side, (1, 3, h, w).
-
-    There are about ``cells`` along the shorter side.
-    """
-    stride = max(1, min(image.shape[1:]) // cells)
+    stride = max(1, min(image.shape[1:]) // 120)
     light = torch.nn.functional.avg_pool2d(image.detach().cpu().float()[None], stride)
-    return band_of_ratios(light, float(side_px // stride), PEDESTAL)
+    inner = without_margin(band_of_ratios(light, float(image.shape[1] // stride), PEDESTAL)[0])
+    return float(inner.square().sum(0).sqrt().flatten().quantile(0.99))
 
 
 def first_pass_depths(contacts: Sequence[Contact], response: ResponseField, pitch_mm: float) -> list[Tensor]:

@@ -2,7 +2,6 @@
 
 import statistics
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -117,30 +116,20 @@ def colour_share(image: Tensor, background: Tensor) -> float | None:
     return float((colour.square().mean() / contact.square().mean()).sqrt())
 
 
-class Sorted(NamedTuple):
-    """Presses that can be used.
-
-    Attributes:
-        kept: in the order given.
-        left_out: index among those given, and why, of each other.
-    """
-
-    kept: list[Press]
-    left_out: list[tuple[int, str]]
-
-
-def sort_presses(background: Tensor, presses: Sequence[Press]) -> Sorted:
+def sort_presses(background: Tensor, presses: Sequence[Press]) -> tuple[list[Press], list[tuple[int, str]]]:
     """Presses that can be held against the background. A few that cannot are left out; if they are half of all, none is used.
 
     Args:
         background: (3, H, W) in [0, 1].
         presses: checked, with names.
+    Returns:
+        The presses that are kept; the index among those given, and why, of each other.
     Raises:
         ValueError: presses with a flaw (:class:`torchvts.model.usable.FrameCheck`), or of another unit; one image with two
             diameters; a background much darker than the presses.
     """
     if not presses:
-        return Sorted([], [])
+        return [], []
     check = FrameCheck(background.detach())
     flaws = [check.flaw(press.image[None]) for press in presses]
     _check_darkness(background, [press.image for press, flaw in zip(presses, flaws) if flaw is None or flaw.name != "overexposed"])
@@ -168,8 +157,7 @@ def sort_presses(background: Tensor, presses: Sequence[Press]) -> Sorted:
             )
         if k not in reasons and place != k:
             reasons[k] = f"it is {first.name} once more"
-    kept = [press for k, press in enumerate(presses) if k not in reasons]
-    return Sorted(kept, sorted(reasons.items()))
+    return [press for k, press in enumerate(presses) if k not in reasons], sorted(reasons.items())
 
 
 def _check_darkness(background: Tensor, presses: Sequence[Tensor]) -> None:

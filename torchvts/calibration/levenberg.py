@@ -1,8 +1,7 @@
-"""Levenberg-Marquardt as a torch optimiser for small least-squares problems, with forward-mode derivatives."""
+"""Levenberg-Marquardt as a torch optimiser for small least-squares problems."""
 
 import inspect
 from collections.abc import Callable
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -21,7 +20,7 @@ class LevenbergMarquardt(Optimizer):
         >>> x = torch.zeros(1, 1, requires_grad=True)
         >>> optimiser = LevenbergMarquardt(x)
         >>> for _ in range(20):
-        ...     loss = optimiser.step(lambda values: values.exp() - 2.0)
+        ...     loss = optimiser.step(lambda values: values.exp() - 2.0, lambda values: (values.exp() - 2.0, values.exp()[:, None]))
         >>> round(x.item(), 5) == 0.69315
         True
     """
@@ -37,20 +36,20 @@ class LevenbergMarquardt(Optimizer):
     def step(  # type: ignore[override]
         self,
         closure: Callable[[Tensor], Tensor],
+        linearised: Callable[[Tensor], tuple[Tensor, Tensor]],
         weight: Tensor | None = None,
-        linearised: Callable[[Tensor], tuple[Tensor, Tensor]] | None = None,
     ) -> Tensor:
         """Take one step; a group whose loss would rise keeps its parameters and raises its damping.
 
         Args:
-            closure: maps parameters (G, K) to residuals (G, N).
+            closure: maps parameters (G, K) to residuals (G, N); group g depends only on row g.
+            linearised: maps parameters to residuals and their derivatives (G, K, N).
             weight: (G, N), weights of the squared residuals; None for ones.
-            linearised: maps parameters to residuals and their derivatives (G, K, N); None for :func:`residual_and_jacobian`.
         Returns:
             (G,), half the weighted sum of squares before the step.
         """
         parameter = self.param_groups[0]["params"][0]
-        residual, jacobian = residual_and_jacobian(closure, parameter) if linearised is None else linearised(parameter)
+        residual, jacobian = linearised(parameter)
         weighted = jacobian if weight is None else jacobian * weight[:, None]
         normal_matrix = weighted @ jacobian.transpose(1, 2)
         right = -(weighted @ residual[:, :, None])[:, :, 0]
@@ -64,18 +63,6 @@ class LevenbergMarquardt(Optimizer):
         self.damping = torch.where(better, self.damping * 0.2, self.damping * 10.0).clamp(1e-12, 1e12)
         self.last_step = torch.where(better[:, None], step, self.last_step)
         return before
-
-
-def residual_and_jacobian(closure: Callable[[Tensor], Tensor], parameter: Tensor) -> tuple[Tensor, Tensor]:
-    """Residuals (G, N) and their derivatives (G, K, N) at parameters (G, K); group g depends only on row g."""
-    groups, count = parameter.shape
-
-    def along(tangent: Tensor) -> Any:
-        return torch.func.jvp(closure, (parameter.detach(),), (tangent,))[:2]
-
-    tangents = torch.eye(count, dtype=parameter.dtype, device=parameter.device)[:, None].expand(count, groups, count)
-    residual, columns = torch.func.vmap(along, out_dims=(None, 1))(tangents)  # type: ignore[arg-type]
-    return residual, columns
 
 
 def _half_square(residual: Tensor, weight: Tensor | None) -> Tensor:

@@ -196,7 +196,7 @@ def _solve(pixels: BackgroundPixels, start: Tensor, loop: _Loop) -> _Solution:
         while len(history) < most and still < 3 and held < HELD_STEPS:
             weight, scale = _robust_weight(pixels.residual(parameter.detach()), pixels.usable)
             before = parameter.detach().clone()
-            optimiser.step(pixels.residual, weight, pixels.linearised)
+            optimiser.step(pixels.residual, pixels.linearised, weight)
             held = held + 1 if bool(at_bound(parameter.detach(), span).any()) else 0
             if held:
                 with torch.no_grad():

@@ -54,16 +54,16 @@ def read_presses(folder: str | Path) -> tuple[Tensor, list[Press]]:
     Raises:
         FileNotFoundError, ValueError: as :func:`read_calibration_folder` and :func:`read_labels`.
     """
-    read = read_calibration_folder(folder)
+    background, pressed = read_calibration_folder(folder)
     labels = read_labels(folder) if (Path(folder) / "labels.csv").is_file() else {}
     presses = []
-    for item in read.presses:
+    for item in pressed:
         center, radius = item.center_px, item.radius_px
         if center is None and item.name in labels:
             x, y, radius = labels[item.name]
             center = (x, y)
-        presses.append(Press(item.image(), item.ball_diameter_mm, item.name, center, radius))
-    return read.background, presses
+        presses.append(Press(item.image, item.ball_diameter_mm, item.name, center, radius))
+    return background, presses
 
 
 def check_presses(presses: Sequence[Press], sensor: Sensor) -> list[Press]:

@@ -85,9 +85,10 @@ def by_hand(arguments: argparse.Namespace, picture: Path) -> int:
     if arguments.ball is None:
         raise UsageError("--camera: expected --ball MM beside it, the diameter of the ball that you press")
     ball_mm, until_deg = check_positive("--ball", arguments.ball, 1000.0), check_positive("--until-deg", arguments.until_deg, 90.0)
-    camera = SourceFrames(open_source(arguments.camera, settings=settings_of(arguments)), 1, False, StageClock())
+    camera = SourceFrames(open_source(arguments.camera, settings=settings_of(arguments)), False, StageClock())
     try:
-        sensor = sensor_of(arguments, lambda: camera.readable[0].shape[:2])
+        size = camera.read_first(1)[0].shape[:2]
+        sensor = sensor_of(arguments, lambda: size)
         session = Session(arguments.session or arguments.out.with_name(f"{arguments.out.stem}_presses"), sensor)
         guide = Guide(session, Watch(sensor), ball_mm, until_deg, picture, arguments.force)
         lost = None if guide.reached else play(camera, guide.add)

@@ -18,7 +18,7 @@ from ..model.report import PressRow
 from ..model.summary import NOT_METRIC, where_next
 from ..stream import FIRST_FRAMES, Unreadable, find_background
 from ..stream.background import check_steady, is_touched
-from ..stream.numbered import NumberedFrame
+from ..stream.sources import NumberedFrame
 from ..viz import calibration_figure, save_figure
 from .options import calibrated, read_folder, working
 

@@ -13,6 +13,7 @@ from tqdm import tqdm
 
 from ..calibration import CalibrationWarning, Press, calibrate, read_presses
 from ..core.checks import parse_number
+from ..core.containers import open_film
 from ..core.spelling import suggest
 from ..model import Calibration, Sensor, shipped_sensors
 from ..pipeline import MODES
@@ -54,6 +55,7 @@ def split_files(arguments: argparse.Namespace) -> tuple[Sensor | Calibration, li
     if arguments.background or arguments.press:
         raise UsageError("--background, --press: they are to calibrate with --sensor, not beside a calibration file")
     if not inputs:
+        open_film(Path(first))  # a container of several recordings: names them
         raise UsageError(f"expected a calibration file and an input, got {first}: name both, or --sensor to calibrate")
     return load_calibration(Path(first)), inputs
 

@@ -60,7 +60,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_length_unit(parser)
     parser.add_argument("--pictures", action=argparse.BooleanOptionalAction, help=f"of each frame (of {PICTURES_UP_TO} at most)")
-    parser.add_argument("--workers", type=int, metavar="N", help="loader processes of each rank (up to 4)")
+    parser.add_argument("--workers", type=int, metavar="N", help="threads of each rank that read images (up to 4)")
     parser.add_argument("--threads", type=int, default=1, metavar="N", help="of each rank (1); results vary in last bits")
     parser.add_argument("--overwrite", action="store_true", help="begin anew, whatever --out holds")
     parser.add_argument("--strict", action="store_true", help="stop at the first frame that cannot be used")
@@ -103,7 +103,7 @@ def write_sheet(unit: Calibration, inputs: list[Path], arguments: argparse.Names
     recording = Recording(
         unit, arguments.mode, network=arguments.network, device=arguments.device, contact=contact_of(arguments.contact)
     )
-    items = (item for item in list_items(tuple(inputs) if len(inputs) > 1 else inputs[0], arguments.every) if not item.is_film)
+    items = (item for item in list_items(tuple(inputs), arguments.every) if not item.is_film)
     shown: list[tuple[float | str, Array]] = []
     for item in itertools.islice(items, SHEET):
         try:
@@ -184,7 +184,7 @@ def diagnose_some(unit: Calibration, inputs: list[Path], report: RunReport, ever
     A finding is given once, with its first frame and how many more have it. Of a frame in doubt only faults are given.
     """
     left_out, doubted = ({name for name, _ in rows} for rows in (report.failed, report.doubted))
-    items = list(list_items(tuple(inputs) if len(inputs) > 1 else inputs[0], every))
+    items = list(list_items(tuple(inputs), every))
     if len(items) > DIAGNOSED:
         items = list({item.file.parent: item for item in reversed(items)}.values())[::-1][:DIAGNOSED]
     found: dict[str, list[tuple[str, Finding]]] = {}

@@ -15,7 +15,6 @@ from ..core.checks import check_integer
 from ..model import Calibration, Sensor
 from ..stream import (
     CameraSettings,
-    Recorder,
     TactileStream,
     read_background,
     read_press_images,
@@ -124,10 +123,10 @@ def play(stream: TactileStream | SourceFrames, take: Callable[[Any], bool]) -> O
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-    if isinstance(stream.reader, Recorder):
+    if isinstance(stream, TactileStream) and stream.recorder is not None:
         try:
             stream.close()
-            print(f"recorded {len(stream.reader.times)} raw frames: {stream.reader.path}")
+            print(f"recorded {len(stream.recorder.times)} raw frames: {stream.recorder.path}")
         except OSError as error:
             lost = lost or error
     return lost

@@ -45,6 +45,9 @@ QUALITY = (
     "keyframe", "drift_deg", "drift_mm",
 )  # fmt: skip
 
+NOT_SEEN = {"mm": 5.0, "deg": 30.0}
+"""A motion with a larger standard deviation was not seen: what a contact does not show has 10 mm at its rim."""
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the subcommand."""
@@ -221,13 +224,10 @@ def summary(tracking: _Tracking, stream: TactileStream) -> dict[str, Any]:
 
 
 def _median_std(rows: list[dict[str, object]]) -> dict[str, float | None]:
-    """Median standard deviation of each shift, mm, and of each turn, degrees, over the rows of poses.csv in which it is known."""
-    found: dict[str, float | None] = {}
-    for name in (name.removeprefix("std_") for name in QUALITY if name.startswith("std_")):
-        motion = f"rotation about {name[1]}" if name.startswith("r") else f"translation along {name[0]}"
-        known = [float(str(row[f"std_{name}"])) for row in rows if motion not in str(row["ambiguous"]).split("; ")]
-        found[name] = statistics.median(known) if known else None
-    return found
+    """Median standard deviation of each shift, mm, and of each turn, degrees; None where it was not seen."""
+    names = [name.removeprefix("std_") for name in QUALITY if name.startswith("std_")]
+    found = {name: statistics.median([float(str(row[f"std_{name}"])) for row in rows] or [math.inf]) for name in names}
+    return {name: std if std < NOT_SEEN[name.rpartition("_")[2]] else None for name, std in found.items()}
 
 
 def _several(number: int, name: str) -> str:
@@ -248,8 +248,7 @@ def _print_summary(found: dict[str, Any]) -> None:
     uncertain = found["frames"] - found["lost"] - found["converged"]
     if uncertain:
         print(f"  {_several(uncertain, 'frame')} known less well than to {TRUSTED_DEG:g} degree and {TRUSTED_MM:g} mm")
-        std = found["median_std"]
-        said = {name: "unknown" if value is None else f"{value:.2g}" for name, value in std.items()}
+        said = {name: "not seen" if value is None else f"{value:.2g}" for name, value in found["median_std"].items()}
         shifts, turns = (", ".join(f"{axis} {said[key.format(axis)]}" for axis in "xyz") for key in ("{}_mm", "r{}_deg"))
         print(f"  standard deviations, medians: {shifts} mm; turns about {turns} degrees")
     if found["keyframes"] > 1:

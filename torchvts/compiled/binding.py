@@ -17,7 +17,6 @@ SIGNATURES = {
     "vts_background": "p p p i p",
     "vts_free": "v p",
     "alignment_sums": "v p i i p l i i p p",
-    "part_sums": "v p i i p l i i p p",
     "height_sums": "i p i i p l i p p p p p i i d d p",
     "track_grids": "i p p p i i f i i p p",
 }

@@ -2,6 +2,7 @@
 
 import inspect
 import math
+from typing import Any, TypeVar, cast
 
 import torch
 from torch import Tensor, nn
@@ -23,22 +24,21 @@ from ..skin import weight as weight_module
 from ..skin import zero as zero_module
 from .plan import Values, fields
 
+_Block = TypeVar("_Block", bound=nn.Module)
+
 LIGHTS = 8193
 """Values of a camera whose light stands in a table: between them light^2.2 is a line to 5e-9."""
 
 DEGREES = (2, 4, 6)
 """Degrees for which response.c has loops."""
 
-TERMS = {(False, False): 3, (True, False): 9, (False, True): 13, (True, True): 19}
-"""Terms for which it has, by whether there are products of two and of three changes."""
-
 
 class NotCompiled(Exception):
     """What has no compiled form, in words."""
 
 
-def check_block(name: str, block: object, *kinds: type[nn.Module]) -> None:
-    """Raise unless a block is one of these classes, as the library has it: no subclass, no method replaced, no hook.
+def check_block(name: str, block: object, *kinds: type[_Block]) -> _Block:
+    """The block, if it is one of these classes, as the library has it: no subclass, no method replaced, no hook.
 
     Raises:
         NotCompiled: names the block and what is its own.
@@ -56,6 +56,7 @@ def check_block(name: str, block: object, *kinds: type[nn.Module]) -> None:
         for key, value in vars(parent).items() if parent.__module__.startswith("torchvts.") else ():
             if inspect.isfunction(value) and not value.__module__.startswith("torchvts."):
                 raise NotCompiled(f"{name}.{key} is replaced")
+    return cast(_Block, block)
 
 
 def check_equal(name: str, value: object, expected: object) -> None:
@@ -64,8 +65,8 @@ def check_equal(name: str, value: object, expected: object) -> None:
         raise NotCompiled(f"{name} is {value!r:.60}, not {expected!r:.60} as elsewhere in the pipeline")
 
 
-def _map(name: str, value: Tensor | None, size: tuple[int, int]) -> Tensor | None:
-    """A map (C, H, W) of the size; one of a single pixel is spread over it."""
+def _map(name: str, value: Any, size: tuple[int, int]) -> Any:
+    """A map (C, H, W) of the size, or None for none; one of a single pixel is spread over it."""
     if value is None:
         return None
     if value.shape[-2:] == (1, 1):
@@ -86,45 +87,44 @@ def _same(block: nn.Module, *names: str) -> Values:
 
 def compensate_values(block: nn.Module, size: tuple[int, int]) -> Values:
     """Of :class:`Compensate`."""
-    check_block("compensate", block, Compensate)
-    assert isinstance(block, Compensate)
-    gain = block.gain
-    check_block("compensate.gain", gain, Gain)
+    block = check_block("compensate", block, Compensate)
+    gain = check_block("compensate.gain", block.gain, Gain)
+    steps = _steps("compensate.clean", block.clean, FillDefects, Blur)
+    fill, blur = steps.get(FillDefects), steps.get(Blur)
     none = torch.zeros(0, dtype=torch.int64)
+    weights = [] if blur is None or blur.std_px == 0.0 else blur.weights
     values: Values = _light_values(block.linear) | {
         "gain": _map("compensate.gain.gain", gain.gain, size),
         "pedestal": _pedestals(gain),
-        "defect": none,
-        "neighbours": none,
-        "defects": 0,
-        "blur": torch.zeros(0, dtype=torch.float32),
-        "blur_taps": 0,
+        "defect": none if fill is None else fill.defect,
+        "neighbours": none if fill is None else fill.neighbours,
+        "defects": 0 if fill is None else fill.defect.shape[0],
+        "blur": _floats(weights),
+        "blur_taps": len(weights),
     }
-    kinds = [type(step) for step in block.clean]
-    if kinds not in ([], [FillDefects], [Blur], [FillDefects, Blur]):
-        raise NotCompiled(f"compensate.clean is {', '.join(kind.__name__ for kind in kinds)}")
-    for k, step in enumerate(block.clean):
-        check_block(f"compensate.clean.{k}", step, FillDefects, Blur)
-        if isinstance(step, FillDefects):
-            values |= {"defect": step.defect, "neighbours": step.neighbours, "defects": step.defect.shape[0]}
-        elif isinstance(step, Blur) and step.std_px > 0.0:
-            values |= {"blur": _floats(step.weights), "blur_taps": len(step.weights)}
     return values | _relight_values(block.relight, size)
 
 
 def _light_values(linear: nn.ModuleList) -> Values:
     """What fills markers, and the light of camera values as a table."""
     values: Values = dict.fromkeys(_MARKERS, 0.0) | {"exponent": 1.0, "light_of": None, "lights": 0}
-    if [type(step) for step in linear] not in ([], [FillMarkers], [Linearise], [FillMarkers, Linearise]):
-        raise NotCompiled(f"compensate.linear is {', '.join(type(step).__name__ for step in linear)}")
-    for k, step in enumerate(linear):
-        check_block(f"compensate.linear.{k}", step, FillMarkers, Linearise)
-        if isinstance(step, FillMarkers):
-            values |= {field: getattr(step, name) for field, name in _MARKERS.items()}
-        else:
-            light = step(torch.linspace(0.0, 1.0, LIGHTS, dtype=torch.float64)).float()
-            values |= {"exponent": step.gamma, "light_of": light, "lights": LIGHTS}
+    steps = _steps("compensate.linear", linear, FillMarkers, Linearise)
+    if (fill := steps.get(FillMarkers)) is not None:
+        values |= {field: getattr(fill, name) for field, name in _MARKERS.items()}
+    if (linearise := steps.get(Linearise)) is not None:
+        light = linearise(torch.linspace(0.0, 1.0, LIGHTS, dtype=torch.float64)).float()
+        values |= {"exponent": linearise.gamma, "light_of": light, "lights": LIGHTS}
     return values
+
+
+def _steps(name: str, steps: nn.ModuleList, *kinds: type[nn.Module]) -> dict[type, Any]:
+    """Steps by their class: of these classes, each once at most, in this order."""
+    found = [type(step) for step in steps]
+    if found != [kind for kind in kinds if kind in found]:
+        raise NotCompiled(f"{name} is {', '.join(kind.__name__ for kind in found)}")
+    for k, step in enumerate(steps):
+        check_block(f"{name}.{k}", step, *kinds)
+    return dict(zip(found, steps, strict=True))
 
 
 _MARKERS = {f"marker_{name.removesuffix('_px')}": name for name in FillMarkers().to_dict()}
@@ -176,8 +176,7 @@ def normals_values(name: str, model: nn.Module, gradient: nn.Module) -> Values:
         NotCompiled: another model, a glossy skin, or maps that are no polynomials.
     """
     check_block(name, model, NormalFromIntensity, NormalFromResponse)
-    check_block("solve.gradient", gradient, GradientFromNormal)
-    assert isinstance(gradient, GradientFromNormal)
+    gradient = check_block("solve.gradient", gradient, GradientFromNormal)
     # of the other model: no tables, and numbers that nothing reads
     values: Values = {field: 0 if fields()[field][0] in ("i", "d") else None for field in _LIGHTS + _RESPONSE}
     values["max_slope"] = gradient.max_slope
@@ -200,8 +199,7 @@ def _lights_values(name: str, model: NormalFromIntensity) -> Values:
         raise NotCompiled(f"{name}.lights are glossy")
     check_equal(f"{name}.camera_height_mm", model.camera_height_mm, math.inf)
     model.follow_lights()
-    shadowed = model.shadowed
-    check_block(f"{name}.shadowed", shadowed, shadowed_module.ShadowedPixels)
+    shadowed = check_block(f"{name}.shadowed", model.shadowed, shadowed_module.ShadowedPixels)
     height, width = (int(n) for n in model.inverse.shape[2:])
     return {
         "height": height,
@@ -231,7 +229,7 @@ def _response_values(name: str, model: NormalFromResponse) -> Values:
     by_depth = _polynomials(per_mm, place, 2)
     if field is None or by_depth is None:
         raise NotCompiled(f"{name} has maps that are no polynomials along rows")
-    check_equal(f"{name}.maps", maps.shape[0], TERMS[(model.products, model.cubic)])
+    check_equal(f"{name}.maps", maps.shape[0], len(model.terms))
     return {
         "height": int(maps.shape[2]),
         "width": int(maps.shape[3]),
@@ -265,14 +263,13 @@ def check_solver(name: str, block: nn.Module, mm_per_pixel: float) -> None:
 
 def mask_values(block: nn.Module, size: tuple[int, int], takes_slopes: bool) -> Values:
     """Of :class:`ContactMask`."""
-    check_block("mask", block, ContactMask)
-    assert isinstance(block, ContactMask)
+    block = check_block("mask", block, ContactMask)
     cell = max(1, min(size) // block.cells)
-    per_noise = whole_cell_means(_full("mask.per_noise", block.per_noise, size)[None], cell)
+    per_noise = whole_cell_means(_map("mask.per_noise", block.per_noise, size)[None], cell)
     return {
         "mask_cell": cell,
-        "mask_flat": _full("mask.flat", block.flat, size),
-        "per_light": _full("mask.per_light", block.per_light, size),
+        "mask_flat": _map("mask.flat", block.flat, size),
+        "per_light": _map("mask.per_light", block.per_light, size),
         "mask_noise": per_noise,
         "mask_blur": _floats(block.weights),
         "mask_taps": len(block.weights),
@@ -287,16 +284,9 @@ def mask_values(block: nn.Module, size: tuple[int, int], takes_slopes: bool) -> 
     } | _same(block, "by_colour", "sigmas", "least_spread", "most_spread", "rough", "grey_share")
 
 
-def _full(name: str, value: Tensor, size: tuple[int, int]) -> Tensor:
-    found = _map(name, value, size)
-    assert found is not None
-    return found
-
-
 def zero_values(block: nn.Module, size: tuple[int, int]) -> Values:
     """Of :class:`ZeroBackground`."""
-    check_block("solve.zero", block, ZeroBackground)
-    assert isinstance(block, ZeroBackground)
+    block = check_block("solve.zero", block, ZeroBackground)
     cell = max(1, min(size) // block.cells)
     h, w = size[0] // cell, size[1] // cell
     pitch, like = cell * block.mm_per_pixel, torch.zeros(0, dtype=torch.float64)
@@ -327,8 +317,7 @@ def _pairs(lines: Tensor) -> Tensor:
 
 def contact_values(block: nn.Module, size: tuple[int, int]) -> Values:
     """Of :class:`ContactFromDepth`."""
-    check_block("contact", block, ContactFromDepth)
-    assert isinstance(block, ContactFromDepth)
+    block = check_block("contact", block, ContactFromDepth)
     cell = min(block.cell, *size)
     pitch = cell * block.mm_per_pixel
     weights = gaussian_weights(block.blur_mm / pitch)

@@ -18,14 +18,6 @@ def alignment_sums(field: Tensor, columns: Tensor, limits: npt.NDArray[Any], sco
     return sums
 
 
-def part_sums(field: Tensor, columns: Tensor, parts: int, limits: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """Sums (parts, 56) float64 of as many runs of pixels, as of :func:`alignment_sums`."""
-    sums = np.empty((parts, 56))
-    inputs = (field.data_ptr(), *field.shape[:2], columns.data_ptr(), columns.stride(0), columns.shape[1], parts)
-    loaded().part_sums(*inputs, limits.ctypes.data, sums.ctypes.data)
-    return sums
-
-
 def height_sums(
     field: Tensor, columns: Tensor, limits: npt.NDArray[Any], cells: tuple[npt.NDArray[Any], ...], most_mm: float, white_mm: float
 ) -> npt.NDArray[Any]:

@@ -303,11 +303,6 @@ def check_shape(name: str, value: object, shape: Sequence[int], like: str = "") 
         raise ValueError(f"{name}: expected {tuple(shape)}{f' like {like}' if like else ''}, got {tuple(value.shape)}")
 
 
-def in_range(low: float, high: float) -> bool:
-    """Whether the ends of an image's values are in [0, 1], but for rounding; not if one is NaN."""
-    return low >= -OVERSHOOT and high <= 1.0 + OVERSHOOT
-
-
 def check_range(name: str, image: Tensor) -> None:
     """Raise unless every value is finite and in [0, 1]. Reads values, which :func:`torch.func.vmap` does not let."""
     if image.numel() == 0:
@@ -323,7 +318,7 @@ def check_range(name: str, image: Tensor) -> None:
     if not (math.isfinite(low) and math.isfinite(high)):
         count = int((~torch.isfinite(image)).sum())
         raise ValueError(f"{name}: expected finite values, got {count} NaN or infinite: a camera or an upstream division failed")
-    if not in_range(low, high):
+    if not (low >= -OVERSHOOT and high <= 1.0 + OVERSHOOT):
         cause = "0-255 given for 0-1: divide by 255" if high > 1.5 else "clamp it to [0, 1]"
         if low < -0.1 and 0.3 < high < 20.0:
             cause = "normalised by mean and standard deviation, or scaled to [-1, 1], as for a network? give value / 255"
@@ -362,17 +357,12 @@ def check_least(name: str, value: object, least: float = 0.0, most: float = math
 
 def _check_number(name: str, value: object, least: float, most: float, bound: str) -> float:
     if isinstance(value, bool) or not isinstance(value, numbers.Real):
-        raise TypeError(f"{name}: expected a number, got {_kind_and_comma(value)}")
+        comma = f" {brief(value)}: write a decimal point" if isinstance(value, str) and "," in value else ""
+        raise TypeError(f"{name}: expected a number, got {type(value).__name__}{comma}")
     number = _float(value)
     if not math.isfinite(number) or not least <= number <= most:
         raise ValueError(f"{name}: expected a number {bound}, got {brief(value)}")
     return number
-
-
-def _kind_and_comma(value: object) -> str:
-    """The type of a value; of text with a decimal comma also the text and what to write."""
-    kind = type(value).__name__
-    return f"{kind} {brief(value)}: write a decimal point" if isinstance(value, str) and "," in value else kind
 
 
 def check_camera_height(value: object) -> float:

@@ -99,8 +99,8 @@ def make_folder(path: str | Path) -> Path:
     return path
 
 
-def check_text_name(name: str, path: str | Path, reader: str = "OpenCV") -> str:
-    """Return a path as text for a library that crashes on names that are not UTF-8, or raise.
+def check_text_name(name: str, path: str | Path) -> str:
+    """Return a path as text for OpenCV, which crashes on names that are not UTF-8, or raise.
 
     Raises:
         ValueError: the name is not UTF-8.
@@ -109,7 +109,7 @@ def check_text_name(name: str, path: str | Path, reader: str = "OpenCV") -> str:
     try:
         text.encode()
     except UnicodeEncodeError:
-        raise ValueError(f"{name}: expected a name in UTF-8, which {reader} needs, got {text!a}: rename it") from None
+        raise ValueError(f"{name}: expected a name in UTF-8, which OpenCV needs, got {text!a}: rename it") from None
     return text
 
 
@@ -205,16 +205,11 @@ def read_pixels(path: str | Path) -> Pixels:
         )
     if path.suffix.lower() in REMEDIES:
         raise ValueError(f"{path}: expected an image or a recording: {REMEDIES[path.suffix.lower()]}")
-    _check_still(path)
-    return check_colour(decode_image(path, IN_COLOUR), path)
-
-
-def _check_still(path: Path) -> None:
-    """Refuse a file of several frames, of which only the first would be read."""
     with path.open("rb") as stream:
         check_still_head(stream.read(64), path)
     if (count := count_pages(path)) > 1:
         raise ValueError(f"{path}: expected one image, got a TIFF of {count} pages: vts.frames and torchvts reconstruct take all")
+    return check_colour(decode_image(path, IN_COLOUR), path)
 
 
 def check_still_head(head: bytes, path: Path) -> None:

@@ -99,8 +99,8 @@ class Facts(NamedTuple):
     doubts: Sequence[str] = ()
 
 
-def write_result(path: str | Path, output: DepthOutput, facts: Facts, frame: str, doubt: str = "") -> None:
-    """Write one frame as npz, compressed; the same values give the same bytes.
+def write_result(path: str | Path, output: DepthOutput, facts: Facts, frame: str, doubt: str = "", compressed: bool = True) -> None:
+    """Write one frame as npz; the same values give the same bytes.
 
     Args:
         path: the file, ending in .npz.
@@ -108,13 +108,14 @@ def write_result(path: str | Path, output: DepthOutput, facts: Facts, frame: str
         facts: of the unit that it is from.
         frame: name of the frame.
         doubt: why less may have been seen in it than is there; "" for nothing.
+        compressed: False for what is joined with others, and compressed then.
     """
     maps = zip(MAPS, (output.depth_mm, output.normal, output.gradient, output.contact, output.deformed))
     arrays = {name: values[0].detach().cpu().numpy().astype(MAPS[name][1]) for name, values in maps}
     arrays = {name: values[0] if MAPS[name][0] == 1 else values for name, values in arrays.items()}
     given = facts._replace(doubts=np.array(facts.doubts, dtype=np.str_))._asdict()  # type: ignore[arg-type]
     own = {"frames": [frame], "frame_doubts": [doubt], "units": json.dumps(UNITS), "format": FORMAT}
-    with write_atomically(path) as temporary, _archive(temporary) as archive:
+    with write_atomically(path) as temporary, _archive(temporary, compressed) as archive:
         for name, values in {**arrays, **given, **own}.items():
             _write_array(archive, name, [np.asarray(values)], None)
 
@@ -143,8 +144,8 @@ def _part(path: Path, name: str) -> Array:
     return values
 
 
-def _archive(path: Path) -> zipfile.ZipFile:
-    return zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1)
+def _archive(path: Path, compressed: bool = True) -> zipfile.ZipFile:
+    return zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED if compressed else zipfile.ZIP_STORED, compresslevel=1)
 
 
 def _write_array(archive: zipfile.ZipFile, name: str, arrays: Any, count: int | None) -> None:

@@ -54,8 +54,8 @@ class Item(NamedTuple):
         return self.stem if number < 0 else f"{self.stem}_{number:06d}"
 
 
-Source = Path | tuple[Path, ...]
-"""An image, a video, a recording in a container, a folder with all below it; or several of them."""
+Source = tuple[Path, ...]
+"""Images, videos, recordings in containers, folders with all below them; one or more."""
 
 
 def one_line(text: str) -> str:
@@ -71,7 +71,7 @@ def one_line(text: str) -> str:
     )
 
 
-def list_items(source: str | Source, every: int = 1) -> Iterator[Item]:
+def list_items(source: str | Path | Source, every: int = 1) -> Iterator[Item]:
     """List the images and videos of a source, by folder and name, numbers as numbers; only the names of one folder are in memory.
 
     Of several files and folders the paths are those below the folder that holds them all, in the order given.
@@ -89,19 +89,19 @@ def list_items(source: str | Source, every: int = 1) -> Iterator[Item]:
         [('a.jpg', 'a.jpg'), ('a.png', 'a.png'), ('b.png', 'b')]
     """
     images = 0
-    for item in _list(source):
+    for item in _list(source if isinstance(source, tuple) else (Path(source),)):
         images += not item.is_film
         if item.is_film or (images - 1) % every == 0:
             yield item
 
 
-def _list(source: str | Source) -> Iterator[Item]:
-    if isinstance(source, tuple):
+def _list(source: Source) -> Iterator[Item]:
+    if len(source) > 1:
         yield from _several(source)
-    elif is_folder(Path(source)):
-        yield from _walk(Path(source), "")
+    elif is_folder(source[0]):
+        yield from _walk(source[0], "")
     else:
-        yield _item(Path(source), "", Path(source).stem)
+        yield _item(source[0], "", source[0].stem)
 
 
 def _item(file: Path, prefix: str, stem: str) -> Item:
@@ -118,7 +118,7 @@ def is_folder(path: Path) -> bool:
     return path.is_dir() and find_container(path) is None
 
 
-def _several(source: tuple[Path, ...]) -> Iterator[Item]:
+def _several(source: Source) -> Iterator[Item]:
     """Items of several files and folders; a file that is named twice, or lies in a folder named too, comes once."""
     named = [Path(os.path.abspath(path)) for path in source]  # "." and ".." by their names
     places = [(path.parent.resolve(), path) for path in named]

@@ -3,7 +3,7 @@
 Every process lists the source in the same order, takes each N-th image and each N-th frame of every video, and passes over what is
 done already (:mod:`.records`). At the end rank 0 writes ``frames.csv``. Only the names of one folder are in memory at a time.
 
-A frame's result does not depend on loader workers or processes: each goes through the pipeline by itself, on the same number of
+A frame's result does not depend on reading threads or processes: each goes through the pipeline by itself, on the same number of
 threads everywhere. (More threads split sums otherwise: depth then differs by up to 3e-7 mm.)
 """
 
@@ -80,7 +80,7 @@ def reconstruct_dataset(
         contact: thresholds of contact; None for the usual ones.
         background_frames: first frames of a video, which show the skin without contact; 0 uses the calibration as it is, and so
             does a video where they show contact or that is shorter, with a note.
-        workers: loader processes of each rank; None chooses.
+        workers: threads of each rank that read images; None chooses.
         threads: of each rank. Results are bit for bit the same only for the same number, so it is one of the settings kept.
         overwrite: begin anew, whatever ``out`` holds.
         strict: stop at the first frame that cannot be used.
@@ -105,14 +105,15 @@ def reconstruct_dataset(
     ):
         check_integer(name, number, least)
     if workers is not None:
-        check_integer("workers", workers, 0)
+        check_integer("workers", workers, 1)
     unit = Calibration.load(calibration)
     check_device(device)
     if network is not None:
         unit_pipeline(unit, mode, network, contact)  # a bad one is refused before anything is written
     _check_source(source, out)
+    names = os.pathsep.join(str(path.resolve()) for path in source)
     settings = Settings(
-        _digest(calibration), _digest(network), _names(source), mode, format, cloud, pictures, every, device, threads,
+        _digest(calibration), _digest(network), names, mode, format, cloud, pictures, every, device, threads,
         __version__, str(torch.__version__), background_frames, None if contact is None else asdict(contact), length_unit,
     )  # fmt: skip
     before = torch.get_num_threads()
@@ -131,18 +132,13 @@ def reconstruct_dataset(
 
 
 def _source(source: str | Path | Sequence[str | Path]) -> Source:
-    """One path as it is, several as a tuple."""
     if isinstance(source, str | Path):
-        return Path(source)
+        return (Path(source),)
     check_sequence("source", source, "paths of images, videos or folders")
     paths = tuple(check_path("source", path) for path in source)
     if not paths:
         raise ValueError("source: expected one path or more, got none")
-    return paths[0] if len(paths) == 1 else paths
-
-
-def _names(source: Source) -> str:
-    return os.pathsep.join(str(path.resolve()) for path in (source if isinstance(source, tuple) else (source,)))
+    return paths
 
 
 def _digest(path: str | Path | None) -> str:
@@ -150,7 +146,7 @@ def _digest(path: str | Path | None) -> str:
 
 
 def _check_source(source: Source, out: Path) -> None:
-    for path in source if isinstance(source, tuple) else (source,):
+    for path in source:
         if open_film(path) is not None:
             continue
         if not path.exists():

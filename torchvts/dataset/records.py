@@ -7,7 +7,6 @@ frames that were being worked on.
 
 import csv
 import json
-import math
 import os
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -23,19 +22,6 @@ from .settings import Settings
 Record = dict[str, Any]
 """``mark`` of the source file; then ``deepest_mm``, ``contact_mm2`` and ``doubt`` of a frame, ``frames`` of a whole video, or
 ``failed``, the reason why there is no result."""
-
-
-def _is_record(record: object) -> bool:
-    """Whether this is a record as :meth:`Records.write` writes it."""
-    if not isinstance(record, dict) or not isinstance(record.get("mark"), list):
-        return False
-    if "failed" in record:
-        return isinstance(record["failed"], str)
-    if "frames" in record:
-        return isinstance(record["frames"], int) and record["frames"] >= 0
-    figures = [record.get(name) for name in ("deepest_mm", "contact_mm2")]
-    sound = all(isinstance(value, float | int) and not isinstance(value, bool) and math.isfinite(value) for value in figures)
-    return sound and isinstance(record.get("doubt"), str) and isinstance(record.get("bytes"), list)
 
 
 @dataclass(frozen=True)
@@ -61,7 +47,7 @@ class Records:
             record = json.loads(self._path(item, frame).read_bytes())
         except (OSError, ValueError, RecursionError):
             return None
-        return record if _is_record(record) and record["mark"] == list(item.mark) else None
+        return record if isinstance(record, dict) and record.get("mark") == list(item.mark) else None
 
     def is_done(self, item: Item, frame: int) -> bool:
         """Whether the result of a frame is there, whole."""

@@ -11,7 +11,6 @@ from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
-from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,14 +19,13 @@ from torch import Tensor
 from tqdm import tqdm
 
 from ..core.checks import in_one_line
-from ..core.files import rgb_from_bgr
-from ..core.recordings import count_frames, cut_short, raw_frames
+from ..core.recordings import count_frames, cut_short
 from ..model import Calibration
 from ..pipeline import DepthOutput
 from ..skin import ContactSettings, motion_of_unit
 from ..stream import Recording
 from .items import Item, list_items
-from .loading import HANDED_OVER, Entry, load_frames
+from .loading import Entry, Loaded, Loader
 from .processes import sum_over_processes
 from .records import Records
 from .writing import Writer
@@ -87,12 +85,12 @@ class Worker:
         total = sum(count_frames(item.file) if item.is_film else 1 for item in items) // world
         if workers is None:
             cores = (os.cpu_count() or 1) // int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
-            workers = 0 if total < 4 * HANDED_OVER else max(1, min(4, cores // 2))
+            workers = max(1, min(4, cores // 2))
         writers = 1 if self.settings.pictures else 4  # matplotlib draws in one thread only
         waiting: deque[tuple[Entry, Future[str]]] = deque()
         start = time.perf_counter()
         with tqdm(total=total, unit="frame", disable=rank > 0 or None, smoothing=0.05) as bar, ThreadPoolExecutor(writers) as pool:
-            for frame, image, output in self._depths(load_frames(self.records, self.sensor, self.share, workers)):
+            for frame, image, output in self._depths(Loader(self.records, self.sensor, self.share, self._begin).frames(workers)):
                 if frame.done:
                     bar.update()
                 else:
@@ -110,43 +108,29 @@ class Worker:
         self.writer.write_summary(rows, len(failed), len(doubted))
         return RunReport(0, rows, rows - done, failed, seconds, self.notes, doubted)
 
-    def _depths(self, loaded: Iterable[tuple[Entry, Tensor | None]]) -> Iterator[_Reconstructed]:
+    def _depths(self, loaded: Iterable[Loaded]) -> Iterator[_Reconstructed]:
         """The frames of this rank with image and depth."""
-        recording, of_video = self.image, None
         for frame, image in loaded:
             if frame.length is not None and (text := cut_short(frame.item.file, frame.length)):
                 self.notes.append((frame.item.path, text))
-            if image is None:
-                yield frame, None, None
-                continue
-            if frame.item.is_film and frame.item != of_video:  # images may come between its frames
-                of_video, recording = frame.item, self._recording(frame.item)
-            yield self._depth(recording if frame.item.is_film else self.image, frame, image)
+            yield (frame, None, None) if image is None else self._depth(frame, image)
 
-    def _recording(self, item: Item) -> Recording:
-        """The recording of a video, by its first frames that can be read."""
+    def _begin(self, item: Item, first: list[Tensor]) -> Recording:
+        """The recording of a video by its first frames that can be read, rectified."""
         count = self.settings.background_frames
+        reason = "" if count <= len(first) else f"background_frames: expected at least {count} frames, got {len(first)}"
         try:
-            first = list(islice(self._readable(item), count))
-            if 0 < count <= len(first):
+            if first and not reason:
                 return self.recording(torch.cat(first))
-            reason = f"background_frames: expected at least {count} frames, got {len(first)}" if count > 0 else ""
         except ValueError as error:
             reason = in_one_line(error)
         if reason:
             self.notes.append((item.path, f"first frames not used, the calibration is used as it is: {reason}"))
         return self.recording()
 
-    def _readable(self, item: Item) -> Iterator[Tensor]:
-        """The frames (1, 3, H, W) of a video that can be read, rectified."""
-        for frame in raw_frames(item.file):
-            try:
-                yield self.sensor.rectify(rgb_from_bgr(frame.read())[None]).clamp(0.0, 1.0)
-            except (OSError, ValueError):  # said where its depth is wanted
-                continue
-
-    def _depth(self, recording: Recording, frame: Entry, image: Tensor) -> _Reconstructed:
+    def _depth(self, frame: Entry, image: Tensor) -> _Reconstructed:
         """Depth of one frame, or why there is none."""
+        recording = frame.recording or self.image
         try:
             reason = recording.unusable(image)
             if reason:

@@ -38,10 +38,11 @@ class Writer:
         stem, path = self.records.out / frame.item.frame_stem(frame.number), self.records.result_file(frame.item, frame.number)
         for folder in {stem.parent, path.parent}:
             folder.mkdir(parents=True, exist_ok=True)
-        if frame.number >= 0 and (joined := self.records.joined_file(frame.item)) is not None:
+        joined = self.records.joined_file(frame.item) if frame.number >= 0 else None
+        if joined is not None:
             joined.unlink(missing_ok=True)  # by an earlier run, of other frames
         if path.suffix == ".npz":
-            write_result(path, result, self.facts, name, frame.doubt)
+            write_result(path, result, self.facts, name, frame.doubt, compressed=joined is None)
         elif path.suffix == ".png":
             write_depth_png(path, result.depth_mm)
         elif path.suffix == ".npy":

@@ -8,12 +8,13 @@ from typing import Any
 import torch
 
 from ..calibration import ROUGH, channel_structure
+from ..compensate.light import unevenness
 from ..core.frame import Conditions
 from ..core.levels import SATURATED
 from ..model.stated_error import stated_deg, stated_error_deg
 from ..model.summary import SATURATED_SHARE
 from ..model.usable import FrameCheck
-from ..pipeline import UNEVEN, UNSEEN_DEG, DepthPipeline, light_levels, light_unevenness
+from ..pipeline import UNEVEN, UNSEEN_DEG, DepthPipeline
 from .camera import blockiness, levels_of, new_spots, pattern_likeness, texture_share
 from .examination import MISFITS, Examination
 from .findings import FAULT_DEG, WARNING_DEG, Finding, by_cost
@@ -133,8 +134,9 @@ def _contact(mask: torch.Tensor) -> float | None:
 
 
 def _contact_in_background(e: Examination) -> float | None:
-    if e.given is None or e.check.other_view(e.given[None]):
-        return None
+    light = _light_of_background(e)
+    if e.given is None or light is None or light["uneven"] > UNEVEN or e.failed_in(e.given) or e.check.flaw(e.given[None]):
+        return None  # what light in another place makes looks like a contact
     with torch.no_grad():
         return _contact(e.pipeline(e.given[None].to(e.unit.background.dtype)).contact)
 
@@ -185,10 +187,12 @@ def _unusable(e: Examination) -> Finding | None:
     return Finding(name, f"the frame {flaw.text}{remedy}", "fault", 1.0)
 
 
-def _failed(e: Examination) -> Figures:
+def _failed(e: Examination, image: torch.Tensor | None) -> Figures:
+    """Number of the channels that an image has lost."""
+    failed = [] if image is None else e.failed_in(image)
     rough = "with two LEDs left mode precise still finds a rough depth, with one none does"
     left = "the response of this unit needs all of them" if e.unit.lights is None else rough
-    return {"value": float(len(e.failed)), "colors": " and ".join(CHANNELS[j] for j in e.failed), "left": left}
+    return {"value": float(len(failed)), "colors": " and ".join(CHANNELS[j] for j in failed), "left": left}
 
 
 def _saturated(e: Examination) -> Figures | None:
@@ -206,7 +210,7 @@ def _change_of(conditions: Conditions | None) -> Figures | None:
     """Levels of the light in the three channels, and how uneven its change is where it is most uneven."""
     if conditions is None:
         return None
-    levels, uneven = light_levels(conditions)[0], float(light_unevenness(conditions).max())
+    levels, uneven = conditions.light[0, :, 0], float(unevenness(conditions.light).max())
     furthest = float(levels[(levels - 1.0).abs().argmax()]) - 1.0
     text = ", ".join(f"{name} {float(level):.0%}" for name, level in zip(CHANNELS, levels))
     return {"value": max(abs(furthest), uneven), "levels": text, "uneven": uneven}
@@ -381,6 +385,8 @@ CHECKS = (
     Check("lights_misfit", _light_at_calibration, "the calibration's lights do not explain its own image ({levels}; uneven by "
           "{uneven:.1%}): other lights, stray light, or a lens; use presses or a prior", above=LEAST_LIGHT),
     # the background of now
+    Check("led_failed", lambda e: _failed(e, e.given), "the {colors} LED has failed (its channel of the background is black "
+          "everywhere): check LED and cable; {left}", "fault", above=0.0),
     Check("contact_in_background", _contact_in_background, _CONTACT.format("background", "in the calibration's"), "fault"),
     Check("light_changed", _light_of_background, "the background's light is {levels} of that at calibration, uneven by "
           "{uneven:.1%}: what is smooth is divided out", _by_unevenness, above=LEAST_LIGHT),
@@ -393,8 +399,8 @@ CHECKS = (
           lambda figures: by_cost(figures["cost"])),
     Check("noise", _noise, "noise of {value:.3f}, {ratio:.1f} times that at calibration, changes normals by {cost:.1f} degrees: "
           "more light, less gain, or average several frames", lambda figures: by_cost(0.5 * figures["cost"])),
-    Check("led_failed", _failed, "the {colors} LED has failed (its channel is black everywhere): check LED and cable; "
-          "{left}", "fault", above=0.0, last=True),
+    Check("led_failed", lambda e: _failed(e, e.image), "the {colors} LED has failed (its channel is black everywhere): check LED "
+          "and cable; {left}", "fault", above=0.0, last=True),
     Check("no_picture", _unusable, last=True),
     Check("saturated", _saturated, "the image is saturated in {where}: reduce the exposure",
           lambda figures: "note" if figures["value"] < 0.1 else "fault" if figures["inside"] > 0.3 else "warning", above=0.02),

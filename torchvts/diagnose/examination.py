@@ -144,10 +144,9 @@ class Examination:
         """Compares images with the background."""
         return FrameCheck(self.value)
 
-    @cached_property
-    def failed(self) -> list[int]:
-        """Channels that are black everywhere and were not at calibration."""
-        level, background = self.image.flatten(1).quantile(0.99, dim=1), self.value.flatten(1).median(dim=1).values
+    def failed_in(self, image: Tensor) -> list[int]:
+        """Channels that are black everywhere in an image (3, H, W), and were not at calibration."""
+        level, background = image.flatten(1).quantile(0.99, dim=1), self.value.flatten(1).median(dim=1).values
         return [j for j in range(3) if level[j] < max(DARKEST, 4.0 * float(self.noise[j])) and background[j] > LIT]
 
     # ---- the light ----

@@ -22,7 +22,7 @@ from ..core.files import check_target, write_atomically
 from ..integration import AdaptiveIntegration
 from ..pipeline import DepthPipeline
 from .onnx_operators import InOnnxOperators, simplify
-from .trace import FromRaw, size_and_dtype, trace
+from .trace import size_and_dtype, trace
 
 METADATA_KEY = "torchvts"
 """Name under which a file keeps its metadata (:func:`describe`) as JSON."""
@@ -91,7 +91,7 @@ def export_torchscript(pipe: DepthPipeline, path: str | Path, rectify: Rectify |
     with warnings.catch_warnings(), write_atomically(path) as temporary:
         warnings.simplefilter("ignore")  # that TorchScript is deprecated
         metadata = {f"{METADATA_KEY}.json": json.dumps(describe(pipe, rectify))}
-        whole = copy.deepcopy(pipe if rectify is None else FromRaw(rectify, pipe)).eval()
+        whole = copy.deepcopy(pipe if rectify is None else torch.nn.Sequential(rectify, pipe)).eval()
         try:
             scripted = torch.jit.script(whole)
         except Exception as error:  # of many kinds, none of them a RuntimeError where the source of a module is not understood

@@ -11,7 +11,7 @@ from ..core.checks import check_batch, check_dtype, check_same_size, check_size,
 from ..integration import Integrator, PoissonDCT, divergence
 from ..integration.poisson import zeroed_in_background
 from ..integration.transforms import cosine_basis, matrices, solve_by_matrices
-from ..pipeline import DepthOutput, DepthPipeline, Shadows
+from ..pipeline import DepthPipeline, Shadows
 
 MAX_BATCH = 1024
 """Largest batch that the graph formats accept."""
@@ -58,18 +58,6 @@ class PoissonBackgroundByMatrix(Integrator):
         return zeroed_in_background(depth, gradient) if self.zero_in_background else depth
 
 
-class FromRaw(nn.Module):
-    """Raw frames of the camera to the outputs of a pipeline."""
-
-    def __init__(self, rectify: Rectify, pipe: DepthPipeline) -> None:
-        super().__init__()
-        self.rectify = rectify
-        self.pipe = pipe
-
-    def forward(self, images: Tensor) -> DepthOutput:
-        return self.pipe(self.rectify(images))
-
-
 class _PlainOutput(nn.Module):
     """A pipeline that returns a plain tuple: a file with a NamedTuple of torchvts would need torchvts to be read."""
 
@@ -104,7 +92,7 @@ def trace(pipe: DepthPipeline, by_matrix: bool, rectify: Rectify | None = None) 
     _make_tables(pipe, images)
     whole: nn.Module = pipe
     if rectify is not None:
-        whole, images = FromRaw(copy.deepcopy(rectify), pipe), torch.full((2, 3, *_raw_size(rectify)), 0.5, dtype=dtype)
+        whole, images = nn.Sequential(copy.deepcopy(rectify), pipe), torch.full((2, 3, *_raw_size(rectify)), 0.5, dtype=dtype)
     shapes = ({0: torch.export.Dim("batch", min=1, max=MAX_BATCH)},)
     with torch.no_grad(), warnings.catch_warnings():
         warnings.simplefilter("ignore")

@@ -1,6 +1,6 @@
 """From gradient to depth."""
 
-from .base import Integrator, WrappedIntegrator, as_integrator
+from .base import Integrator
 from .discontinuities import AdaptiveIntegration
 from .perspective import PerspectiveIntegration, integrate_perspective
 from .poisson import PoissonBackground, PoissonDCT, PoissonDST, divergence, poisson_background, poisson_dct, poisson_dst
@@ -12,8 +12,6 @@ __all__ = [
     "PoissonBackground",
     "PoissonDCT",
     "PoissonDST",
-    "WrappedIntegrator",
-    "as_integrator",
     "divergence",
     "integrate_perspective",
     "poisson_background",

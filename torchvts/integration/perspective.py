@@ -11,9 +11,9 @@ dw/dv likewise with q. w is depth to first order, zero where z is, and z = h (1 
 import torch
 from torch import Tensor, nn
 
-from ..core.checks import check_positive
+from ..core.checks import check_pitch, check_positive, check_record
 from ..core.geometry import pixel_grid_mm
-from .base import Integrator, as_integrator
+from .base import Integrator
 from .poisson import PoissonBackground, check_gradient
 
 LEAST_COSINE = 0.05
@@ -60,7 +60,9 @@ class PerspectiveIntegration(Integrator):
         self.mm_per_pixel = check_positive("mm_per_pixel", mm_per_pixel)
         self.camera_height_mm = check_positive("camera_height_mm", camera_height_mm)
         self.least_facing_mm = LEAST_COSINE * self.camera_height_mm
-        self.integrate = self.poisson(mm_per_pixel) if integrate is None else as_integrator(integrate, mm_per_pixel)
+        self.integrate: nn.Module = self.poisson(mm_per_pixel) if integrate is None else integrate
+        check_record("integrate", self.integrate, nn.Module)
+        check_pitch("integrate", self.integrate, mm_per_pixel)
 
     def forward(self, gradient: Tensor) -> Tensor:
         check_gradient(gradient, 2)

@@ -219,9 +219,8 @@ def camera_above(sensor: "Sensor") -> tuple[float, float, float] | None:
         frame = np.stack((columns - 1.0 - frame[:, 0], frame[:, 1]), 1)
     for _ in range(sensor.turn_deg // 90):  # back by 90 degrees, clockwise
         frame, rows, columns = np.stack((rows - 1.0 - frame[:, 1], frame[:, 0]), 1), columns, rows
-    (fx, skew, cx), (_, fy, cy), _ = sensor.camera_matrix
+    (fx, _, cx), (_, fy, cy), _ = sensor.camera_matrix
     ray = (frame - (cx, cy)) / (fx, fy)
-    ray[:, 0] -= skew / fx * ray[:, 1]
     skin = (corners - (0.5 * (width - 1), 0.5 * (height - 1))) * sensor.mm_per_pixel
     ones, zeros = np.ones((4, 1)), np.zeros((4, 3))
     plane = np.hstack((skin, ones))

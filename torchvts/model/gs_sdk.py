@@ -6,16 +6,15 @@ map is H = -z / mm_per_pixel, so pixels, negative where the skin is pressed in; 
 
 import csv
 import zipfile
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from ..core.checks import brief, check_batch, check_field, check_float_tensor, check_path, check_positive, parse_number
-from ..core.files import png_size, read_image, rgb_from_bgr
+from ..core.files import read_image, rgb_from_bgr
 from ..core.recordings import image_files
 
 CATALOG_COLUMNS = ("experiment_reldir", "diameter(mm)")
@@ -25,51 +24,22 @@ MOST_TABLE_BYTES = 2**24
 """Limit for tables of presses, which have some kilobytes."""
 
 
-@dataclass(frozen=True)
-class GsSdkPress:
+class GsSdkPress(NamedTuple):
     """One ball pressed on the sensor.
 
-    Args:
+    Attributes:
         name: ``experiment_reldir`` in the catalog.
-        image_path: path of ``gelsight.png``.
+        image: (3, H, W) in [0, 1], R, G, B, of the background's size.
         ball_diameter_mm: mm.
-        height: rows of the background, which the image must have too.
-        width: columns of the background, which the image must have too.
         center_px: (x, y) of the ball in pixels, from ``label.npz``; None without that file.
         radius_px: radius of the contact in pixels, from ``label.npz``; None without that file.
     """
 
     name: str
-    image_path: Path
+    image: Tensor
     ball_diameter_mm: float
-    height: int
-    width: int
-    center_px: tuple[float, float] | None = None
-    radius_px: float | None = None
-
-    def image(self) -> Tensor:
-        """Read the image: (3, H, W) in [0, 1], R, G, B.
-
-        Raises:
-            FileNotFoundError: the file does not exist any more.
-            ValueError: not an image, cut short, or of another size than the background.
-        """
-        image = read_image(self.image_path)
-        _check_size(self.image_path, image.shape[1], image.shape[2], self.height, self.width)
-        return image
-
-
-@dataclass(frozen=True, eq=False)
-class GsSdkFolder:
-    """A calibration folder of gs_sdk.
-
-    Attributes:
-        background: (3, H, W) in [0, 1], R, G, B.
-        presses: in the catalog's order.
-    """
-
-    background: Tensor
-    presses: tuple[GsSdkPress, ...]
+    center_px: tuple[float, float] | None
+    radius_px: float | None
 
 
 def _other_way(folder: Path) -> str:
@@ -81,8 +51,8 @@ def _other_way(folder: Path) -> str:
     return f"; without a catalog, name the images: torchvts calibrate {folder / first} --press IMAGE DIAMETER_MM"
 
 
-def read_calibration_folder(folder: str | Path) -> GsSdkFolder:
-    """Read a calibration folder in gs_sdk's layout. Images of presses are read by :meth:`GsSdkPress.image`.
+def read_calibration_folder(folder: str | Path) -> tuple[Tensor, list[GsSdkPress]]:
+    """Read a calibration folder in gs_sdk's layout.
 
     The layout: ``catalog.csv`` with the columns ``experiment_reldir,diameter(mm)``, ``background.png``, and for every row
     ``<experiment_reldir>/gelsight.png`` and, once labelled, ``<experiment_reldir>/label.npz`` with ``center`` (x, y) and
@@ -91,7 +61,7 @@ def read_calibration_folder(folder: str | Path) -> GsSdkFolder:
     Args:
         folder: the folder that holds ``catalog.csv``.
     Returns:
-        A :class:`GsSdkFolder`.
+        The background (3, H, W) in [0, 1], R, G, B, and the presses in the order of the catalog.
     Raises:
         FileNotFoundError: the folder, the catalog, the background or the image of a press is missing.
         ValueError: an empty catalog, other columns, a bad diameter, a press named twice or outside the folder, an image of
@@ -114,7 +84,6 @@ def read_calibration_folder(folder: str | Path) -> GsSdkFolder:
                 f"{path}: no such file: a calibration folder of gs_sdk holds catalog.csv and background.png{_other_way(folder)}"
             )
     background = read_image(background_path)
-    height, width = background.shape[1], background.shape[2]
     presses: list[GsSdkPress] = []
     seen: set[Path] = set()
     for line, row in _read_table(catalog, CATALOG_COLUMNS):
@@ -129,15 +98,16 @@ def read_calibration_folder(folder: str | Path) -> GsSdkFolder:
         seen.add(press)
         # a link may lead out of the folder as well as a name
         image_path, label_path = (_inside(folder, f"{name}/{file}", where) for file in ("gelsight.png", "label.npz"))
-        if not image_path.is_file():
-            raise FileNotFoundError(f"{folder / name / 'gelsight.png'}: no such image: {where} names it")
-        with image_path.open("rb") as stream:
-            size = png_size(stream.read(24))
-        if size is not None:
-            _check_size(image_path, size[0], size[1], height, width)
+        image = read_image(image_path)
+        if image.shape != background.shape:
+            (height, width), (expected_height, expected_width) = image.shape[1:], background.shape[1:]
+            raise ValueError(
+                f"{image_path}: expected {expected_height} x {expected_width} like background.png, got {height} x {width}: "
+                "both must come from the same sensor settings"
+            )
         center, radius = _read_label(label_path) if label_path.is_file() else (None, None)
-        presses.append(GsSdkPress(name, image_path, diameter, height, width, center, radius))
-    return GsSdkFolder(background, tuple(presses))
+        presses.append(GsSdkPress(name, image, diameter, center, radius))
+    return background, presses
 
 
 def read_labels(folder: str | Path) -> dict[str, tuple[float, float, float | None]]:
@@ -336,14 +306,6 @@ def _inside(folder: Path, name: str, where: str) -> Path:
     if path == root or not path.is_relative_to(root):
         raise ValueError(f"{where}: experiment_reldir: expected a folder inside {folder}, got {brief(name)}, which is not")
     return path
-
-
-def _check_size(path: Path, height: int, width: int, expected_height: int, expected_width: int) -> None:
-    if (height, width) != (expected_height, expected_width):
-        raise ValueError(
-            f"{path}: expected {expected_height} x {expected_width} like background.png, got {height} x {width}: "
-            "both must come from the same sensor settings"
-        )
 
 
 def _read_label(path: Path) -> tuple[tuple[float, float], float]:

@@ -194,8 +194,7 @@ def press_next(calibration: Calibration) -> tuple[tuple[int, int], float] | None
         >>> press_next(Calibration.from_lights(lights, Sensor("rig", 48, 64, 0.5))) is None
         True
     """
-    check_calibration("calibration", calibration)
-    found = _over_skin(calibration)
+    found = error_over_skin(calibration)
     if found is None:
         return None
     error, cell, radius_px = found
@@ -208,15 +207,13 @@ def press_next(calibration: Calibration) -> tuple[tuple[int, int], float] | None
     return (column, row), float(inner.max())
 
 
-def error_over_skin(calibration: Calibration) -> Tensor | None:
-    """(h, w), on cells: mean error of normals to expect of slopes like the presses', degrees; None as :func:`press_next`."""
+def error_over_skin(calibration: Calibration) -> tuple[Tensor, int, float] | None:
+    """The error to expect of slopes like the presses', and how large contacts are; None as :func:`press_next`.
+
+    Returns:
+        (h, w), mean error of normals on cells, degrees; pixels of a cell; the median radius of contacts, pixels.
+    """
     check_calibration("calibration", calibration)
-    found = _over_skin(calibration)
-    return None if found is None else found[0]
-
-
-def _over_skin(calibration: Calibration) -> tuple[Tensor, int, float] | None:
-    """The error of :func:`error_over_skin`, pixels of a cell, and the median radius of contacts, pixels."""
     block, sensor, response = _stated_by_covariance(calibration), calibration.sensor, calibration.response
     rows = [row for row in calibration.report.get("presses", []) if row["used"] and "center_px" in row]
     if block is None or response is None or not rows:

@@ -21,7 +21,6 @@ from ..core.checks import (
     check_range,
     check_same_size,
     check_seed,
-    check_tensor,
 )
 from ..core.files import load_tensors, save_tensors
 from ..core.geometry import normal_from_gradient
@@ -152,15 +151,8 @@ class NormalFromMLP(NormalModel):
 
     def check_flat(self, flat: Tensor) -> None:
         """Raise unless ``flat`` is one finite (3, height, width) image in [0, 1]."""
-        if isinstance(flat, Tensor):
-            check_tensor("flat", flat)
-        if not isinstance(flat, Tensor) or tuple(flat.shape) != (3, self.height, self.width):
-            got = tuple(flat.shape) if isinstance(flat, Tensor) else type(flat).__name__
-            raise ValueError(
-                f"flat: expected one image of the flat skin, (3, {self.height}, {self.width}), got {got}: "
-                "it must have the size of the images"
-            )
         check_field("flat", flat)
+        check_same_size("flat", flat, "the images", self.height, self.width)
         check_range("flat", flat)
 
     @classmethod
@@ -201,7 +193,7 @@ class NormalFromMLP(NormalModel):
                 "flat: expected the image of the flat skin, (3, H, W), got None: a bare state dict holds none; "
                 "DepthPipeline.from_gs_sdk takes the background"
             )
-        check_flat_shape(flat)
+        check_field("flat", flat)
         weights = _check_state(path, state)
         options: dict[str, Any] = {name: described[name] for name in ("output", "input_domain", "blur_px") if name in described}
         options |= {} if output is None else {"output": output}
@@ -235,13 +227,6 @@ class NormalFromMLP(NormalModel):
 
     def extra_repr(self) -> str:
         return f"height={self.height}, width={self.width}, output={self.output}"
-
-
-def check_flat_shape(flat: object) -> None:
-    """Raise unless ``flat`` is a tensor (3, H, W)."""
-    if not isinstance(flat, Tensor) or flat.dim() != 3:
-        got = tuple(flat.shape) if isinstance(flat, Tensor) else type(flat).__name__
-        raise ValueError(f"flat: expected one image of the flat skin, (3, H, W), got {got}: take one of the batch with [0]")
 
 
 def _read_state(path: Path) -> object:

@@ -55,8 +55,8 @@ class NormalFromResponse(NormalModel):
         self.max_sine = MAX_SINE
         self.steeper = 0.0 if by_depth is None else by_depth.steeper
         self.reference_mm = 0.0 if by_depth is None else by_depth.reference_mm
-        self.products, self.cubic = field.product_degree >= 0, field.cubic_degree >= 0
-        scale = torch.tensor([CHANGE_SCALE ** -len(term) for term in field.terms()], dtype=torch.float64)
+        self.terms = [list(term) for term in field.terms()]
+        scale = torch.tensor([CHANGE_SCALE ** -len(term) for term in self.terms], dtype=torch.float64)
         self.register_buffer("maps", (field.maps(height, width, mm_per_pixel) * scale[:, None, None, None]).to(dtype))
         per_mm = torch.zeros(0, height, width) if by_depth is None else by_depth.maps(height, width, mm_per_pixel)
         self.register_buffer("per_mm", per_mm.to(dtype))
@@ -85,24 +85,13 @@ class NormalFromResponse(NormalModel):
             change = change - self.per_mm * depth
             if self.steeper > 0.0:
                 change = change / (self.steeper * (depth - self.reference_mm).clamp_min(0.0) + 1.0)
-        inputs = [change[:, 0:1], change[:, 1:2], change[:, 2:3]]
-        maps = self.maps
-        sine = maps[0] * inputs[0]  # (B, 2, H, W)
-        for k in range(1, 3):
-            sine = torch.addcmul(sine, maps[k], inputs[k])
-        if self.products:
-            place = 3
-            for i in range(3):
-                for k in range(i, 3):
-                    sine = torch.addcmul(sine, maps[place], inputs[i] * inputs[k])
-                    place += 1
-        if self.cubic:
-            place = maps.shape[0] - 10
-            for i in range(3):
-                for k in range(i, 3):
-                    for m in range(k, 3):
-                        sine = torch.addcmul(sine, maps[place], inputs[i] * inputs[k] * inputs[m])
-                        place += 1
+        sine = self.maps[0] * change[:, 0:1]  # (B, 2, H, W), of the first term
+        for place in range(1, len(self.terms)):
+            term = self.terms[place]
+            product = change[:, term[0] : term[0] + 1]
+            for k in term[1:]:
+                product = product * change[:, k : k + 1]
+            sine = torch.addcmul(sine, self.maps[place], product)
         squared = torch.addcmul(sine[:, 0:1] * sine[:, 0:1], sine[:, 1:2], sine[:, 1:2])
         kept = (self.max_sine / torch.sqrt(squared + 1e-12)).clamp_max(1.0)
         up = torch.sqrt(1.0 - squared * (kept * kept))

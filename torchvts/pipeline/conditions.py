@@ -1,7 +1,6 @@
 """What frames were seen under, in words: light that is uneven otherwise than at calibration, and slopes that are in doubt."""
 
 import torch
-from torch import Tensor
 
 from ..compensate.light import UNEVEN, unevenness
 from ..core.frame import Conditions
@@ -22,16 +21,6 @@ LOST_SHARE = 0.5
 """Share of a channel that is black or saturated from which it is said."""
 
 
-def light_levels(conditions: Conditions) -> Tensor:
-    """The light of each channel over the background's, (B, 3)."""
-    return conditions.light[:, :, 0]
-
-
-def light_unevenness(conditions: Conditions) -> Tensor:
-    """Root mean square over the image of what the light of each channel is off its level, over that level, (B, 3)."""
-    return unevenness(conditions.light)
-
-
 def usual_unseen_deg(calibration: Calibration, pipe: DepthPipeline) -> float:
     """What a frame of the undeformed skin hides at calibration, degrees: the background, with the noise of one image, by the unit's
     pipeline on the CPU."""
@@ -46,8 +35,8 @@ def usual_unseen_deg(calibration: Calibration, pipe: DepthPipeline) -> float:
 def doubts_of(conditions: Conditions, usual_deg: float) -> list[str]:
     """For each frame why less may have been seen than is there, and what to do about it, or ""."""
     texts = []
-    levels, unevenness = light_levels(conditions), light_unevenness(conditions)
-    for level, uneven, lost, unseen in zip(levels, unevenness, conditions.lost, conditions.unseen_deg, strict=True):
+    parts_of_light = conditions.light[:, :, 0], unevenness(conditions.light)
+    for level, uneven, lost, unseen in zip(*parts_of_light, conditions.lost, conditions.unseen_deg, strict=True):
         parts = [
             f"channel {name} is black or saturated in {float(share):.0%} of the skin"
             for name, share in zip("RGB", lost)

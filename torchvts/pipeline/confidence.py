@@ -5,7 +5,7 @@ pitch or ball, a camera that is not orthographic.
 """
 
 import math
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -15,15 +15,12 @@ from ..core.blur import MOST_BLUR_PX, blur, gaussian_weights
 from ..core.cells import cells_to_pixels, whole_cell_means
 from ..core.checks import (
     check_batch,
-    check_field,
     check_float_tensor,
     check_least,
     check_mask,
     check_positive,
     check_record,
     check_same_size,
-    check_shape,
-    check_switch,
     check_tensor,
 )
 from ..core.geometry import GradientFromNormal
@@ -33,7 +30,7 @@ from ..integration import PoissonBackground
 from ..model.calibration import PEDESTAL, Calibration, check_calibration
 from ..model.response_field import CHANGE_SCALE, MAX_SLOPE
 from ..model.stated_error import StatedError
-from ..normals import NormalFromIntensity, NormalFromResponse, as_normal_model
+from ..normals import NormalFromIntensity, NormalFromResponse
 from ..skin import ContactSettings, unseen_deg
 from ..skin.weight import LEAST_SLOPE_SPREAD, WEIGHT_CELLS, WEIGHT_RISE
 from .depth import DepthOutput, DepthPipeline, eval_around
@@ -164,16 +161,10 @@ class Confidence(nn.Module):
     Where the skin has not moved, a small contact as steep as could have hidden may have been missed.
 
     Args:
-        normals: the calibrated block of the pipeline.
-        noise_std: (3, H, W), of the compensated image. That of a channel that is black or saturated is a usual change.
-        image_noise_std: (3,), of the image, in image value, at calibration.
-        error: of the model: for point lights (3, H, W), that of the light per unit of ``|n - n_flat|``; for a response field a
-            :class:`~torchvts.model.StatedError`.
-        mm_per_pixel: pixel pitch, mm.
-        measured: whether the background was an image.
-        blur_px: of the compensated image.
-        pattern: standard deviation of the logarithm of the background's light over the image.
-        presses: number of presses from which the size of the model's error is known; None where it is exact.
+        calibration: of the unit.
+        normals: its block in the pipeline, to share; None makes one.
+    Raises:
+        TypeError: no Calibration, or normals that are not of the calibrated model, of whose errors calibration knows nothing.
     Source:
         propagation of noise through photometric stereo: Barsky and Petrou, Signal Processing 86(11), 2006.
     Example:
@@ -191,41 +182,29 @@ class Confidence(nn.Module):
     image_noise: Tensor
     light_std: Tensor
 
-    def __init__(
-        self,
-        normals: nn.Module,
-        noise_std: Tensor,
-        image_noise_std: Tensor,
-        error: Tensor | StatedError,
-        mm_per_pixel: float,
-        *,
-        measured: bool = True,
-        blur_px: float = 0.0,
-        pattern: float = 0.0,
-        presses: float | None = None,
-    ) -> None:
+    def __init__(self, calibration: Calibration, normals: nn.Module | None = None) -> None:
         super().__init__()
-        check_record("normals", normals, nn.Module, "the block of the pipeline")
-        check_field("noise_std", noise_std)
-        check_shape("image_noise_std", image_noise_std, (3,))
-        self.by_lights = not isinstance(error, StatedError)
-        self.stated: nn.Module = nn.Identity()
-        light_std = torch.zeros_like(noise_std)
-        if isinstance(error, StatedError):
-            self.stated = error
-        else:
-            check_float_tensor("error", error)
-            check_shape("error", error, noise_std.shape, "noise_std")
-            light_std = error
-        self.mm_per_pixel = check_positive("mm_per_pixel", mm_per_pixel)
-        check_switch("measured", measured)
-        blur_px = check_least("blur_px", blur_px, 0.0, MOST_BLUR_PX)
-        self.normals = as_normal_model(normals)
-        self.uses_depth = self.normals.uses_depth
-        self.fixed = 1.0 if measured else 0.0
-        pattern = check_least("pattern", pattern)
+        check_calibration("calibration", calibration)
+        self.by_lights = calibration.response is None
+        kind = NormalFromIntensity if self.by_lights else NormalFromResponse
+        block = kind.from_calibration(calibration) if normals is None else normals
+        if not isinstance(block, kind):
+            raise TypeError(
+                f"normals: expected the calibrated {kind.__name__}, got {type(block).__name__}: of a module put in its place "
+                "no error is known"
+            )
+        self.normals, self.uses_depth = block, block.uses_depth
+        noise_std, mm_per_pixel = calibration.compensated_noise_std, calibration.sensor.mm_per_pixel
+        self.mm_per_pixel = mm_per_pixel
+        self.blur_px = blur_px = calibration.sensor.blur_px
+        # of response fields the error, and the presses from which its size is known; of lights that of the light per |n - n_flat|
+        self.stated: nn.Module = nn.Identity() if self.by_lights else StatedError.from_calibration(calibration)
+        light_std = light_std_by_fit(calibration) if self.by_lights else torch.zeros_like(noise_std)
+        used = sum(row.get("weight", 1.0) for row in calibration.report.get("presses", []))
+        presses = None if self.by_lights else used + (OF_TYPE if "prior_deg" in calibration.report else OF_SENSORS)
+        self.fixed = 1.0 if calibration.measured else 0.0
+        pattern = float((calibration.background + PEDESTAL).log().flatten(1).std(dim=1).square().mean().sqrt())
         self.per_uneven = pattern / (pattern**2 + FAINT_PATTERN**2)
-        self.blur_px = blur_px
         edge_px = math.sqrt(2.0 * blur_px**2 + GRID_PX2)  # the camera's own blur is taken to be as wide as the calibration's
         self.weights = gaussian_weights(min(edge_px, MOST_BLUR_PX))
         self.reach = math.ceil(edge_px)
@@ -245,37 +224,10 @@ class Confidence(nn.Module):
         self.as_gain, self.as_tilt = (1.0, 1.0) if self.by_lights else (ALIKE, 0.5 * ALIKE)
         self.kink_variance_mm = (KINK_PX * mm_per_pixel) ** 2
         self.register_buffer("noise", noise_std.detach().clone())
-        self.register_buffer("image_noise", image_noise_std.detach().clone())
+        self.register_buffer("image_noise", calibration.noise_std.detach().clone())
         self.register_buffer("light_std", light_std.detach().clone())
         self.gradient = GradientFromNormal()
         self.integrate = PoissonBackground(mm_per_pixel)
-
-    @classmethod
-    def from_calibration(cls, calibration: Calibration, normals: nn.Module | None = None) -> "Confidence":
-        """The block of a calibrated unit.
-
-        Args:
-            calibration: the unit.
-            normals: its block in the pipeline, to share; None makes one.
-        Raises:
-            TypeError: normals that are not of the calibrated model, of whose errors calibration knows nothing.
-        """
-        check_calibration("calibration", calibration)
-        kind = NormalFromResponse if calibration.response is not None else NormalFromIntensity
-        block = kind.from_calibration(calibration) if normals is None else normals
-        if not isinstance(block, kind):
-            raise TypeError(
-                f"normals: expected the calibrated {kind.__name__}, got {type(block).__name__}: of a module put in its place "
-                "no error is known"
-            )
-        sensor, noise = calibration.sensor, calibration.compensated_noise_std
-        error = light_std_by_fit(calibration) if calibration.response is None else StatedError.from_calibration(calibration)
-        options: dict[str, Any] = {"measured": calibration.measured, "blur_px": sensor.blur_px}
-        if calibration.response is not None:
-            used = sum(row.get("weight", 1.0) for row in calibration.report.get("presses", []))
-            options["presses"] = used + (OF_TYPE if "prior_deg" in calibration.report else OF_SENSORS)
-        options["pattern"] = float((calibration.background + PEDESTAL).log().flatten(1).std(dim=1).square().mean().sqrt())
-        return cls(block, noise, calibration.noise_std, error, sensor.mm_per_pixel, **options)
 
     def forward(self, images: Tensor, compensated: Tensor, out: DepthOutput, light: Tensor | None = None) -> ConfidentOutput:
         """The output, and its bounds.
@@ -462,12 +414,12 @@ class ConfidentPipeline(nn.Module):
 
     Args:
         pipe: the pipeline.
-        confidence: from the same calibration.
+        confidence: of the same calibration.
     Example:
         >>> from torchvts import PointLights, Sensor
         >>> lights = PointLights([[20, 0, 30], [-10, 17, 30], [-10, -17, 30]], [900, 900, 900])
         >>> cal = Calibration.from_lights(lights, Sensor("rig", 48, 64, 0.5))
-        >>> pipe = ConfidentPipeline(DepthPipeline.from_calibration(cal), Confidence.from_calibration(cal))
+        >>> pipe = ConfidentPipeline(DepthPipeline.from_calibration(cal), Confidence(cal))
         >>> pipe(cal.model_image[None])._fields[5:]
         ('normal_95_deg', 'depth_95_mm', 'confidence', 'frame_confidence', 'factors_deg')
     """
@@ -475,7 +427,7 @@ class ConfidentPipeline(nn.Module):
     def __init__(self, pipe: DepthPipeline, confidence: Confidence) -> None:
         super().__init__()
         check_record("pipe", pipe, DepthPipeline, "DepthPipeline.from_calibration makes one")
-        check_record("confidence", confidence, Confidence, "Confidence.from_calibration makes one")
+        check_record("confidence", confidence, Confidence, "Confidence(calibration) makes one")
         self.pipe = pipe
         self.relights = isinstance(pipe.compensate, Compensate)
         self.confidence = confidence
@@ -496,7 +448,7 @@ class ConfidentPipeline(nn.Module):
             TypeError: no Calibration; or ``normals`` that are not the calibrated model.
         """
         pipe = DepthPipeline.from_calibration(calibration, mode, normals=normals, integrate=integrate, contact=contact)
-        return eval_around(cls(pipe, Confidence.from_calibration(calibration, pipe.normals)), normals, integrate)
+        return eval_around(cls(pipe, Confidence(calibration, pipe.normals)), normals, integrate)
 
     if TYPE_CHECKING:
 

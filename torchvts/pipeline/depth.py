@@ -17,13 +17,13 @@ from ..core.checks import (
     check_record,
 )
 from ..core.frame import Conditions, DepthOutput, Frame, Solution
-from ..core.geometry import GradientFromNormal, normal_from_gradient
+from ..core.geometry import GradientFromNormal, gradient_of_depth, normal_from_gradient
 from ..core.settings import check_settings, settings_as_tensor
-from ..integration import PoissonDCT, WrappedIntegrator, as_integrator
+from ..integration import PoissonDCT
 from ..model import Calibration, FillMarkers, Sensor, check_calibration
 from ..normals import NormalFromIntensity, NormalFromMLP, NormalFromResponse, WrappedNormals, as_normal_model, check_domain
 from ..skin import ContactFromDepth, ContactMask, ContactSettings, ZeroBackground, moved, unseen_deg
-from .refine import Refine, SlopesOfDepth, SlopesOfPixels
+from .refine import Refine
 from .solve import Solve
 
 if TYPE_CHECKING:
@@ -76,12 +76,13 @@ class DepthPipeline(nn.Module):
         super().__init__()
         check_choice("mode", mode, MODES)
         touching = ContactFromDepth(mm_per_pixel) if contact is None else contact
-        given = {"compensate": compensate, "mask": mask, "gradient": gradient, "contact": touching}
+        given = {"compensate": compensate, "mask": mask, "gradient": gradient, "integrate": integrate, "contact": touching}
         for name, block in given.items():
             check_record(name, block, nn.Module)
         mm_per_pixel = check_positive("mm_per_pixel", mm_per_pixel)
-        model, integrator = as_normal_model(normals), as_integrator(integrate, mm_per_pixel)
+        model = as_normal_model(normals)
         check_pitch("normals", model, mm_per_pixel)
+        check_pitch("integrate", integrate, mm_per_pixel)
         check_domain(model, compensate.output_domain if isinstance(compensate, Compensate) else None)
         if mode == "precise" and not (model.uses_depth or model.normals_from_depth):
             raise ValueError(
@@ -94,11 +95,11 @@ class DepthPipeline(nn.Module):
         self._metric = False
         self.compensate = compensate
         self.mask = mask
-        self.solve = Solve(model, gradient, integrator, ZeroBackground(mm_per_pixel))
+        self.solve = Solve(model, gradient, integrate, ZeroBackground(mm_per_pixel))
         own = isinstance(mask, ContactMask) and type(mask).forward is ContactMask.forward
         self.takes_slopes = own and model.calibrated
         self.refine: nn.Module = Refine(self.solve, model.passes if mode == "precise" and model.uses_depth else 1)
-        self.slopes = SlopesOfDepth(mm_per_pixel) if model.normals_from_depth else SlopesOfPixels()
+        self.slopes_of_depth = model.normals_from_depth
         self.contact = touching
 
     def __setattr__(self, name: str, value: Any) -> None:
@@ -224,7 +225,7 @@ class DepthPipeline(nn.Module):
         """Depth and slopes of a solution, and where the skin has moved and the object touches it."""
         deformed = moved(frame.weight.detach(), solution.depth_mm.detach())
         contact = self.contact(solution.depth_mm.detach(), deformed)
-        gradient = self.slopes(solution)
+        gradient = gradient_of_depth(solution.depth_mm, self.mm_per_pixel) if self.slopes_of_depth else solution.gradient
         return DepthOutput(solution.depth_mm, gradient, normal_from_gradient(gradient), contact, deformed)
 
     @torch.jit.unused
@@ -283,9 +284,8 @@ class DepthPipeline(nn.Module):
 
     @property
     def integrate(self) -> nn.Module:
-        """The integrator, as it was given."""
-        integrator = self.solve.integrate
-        return integrator.module if isinstance(integrator, WrappedIntegrator) else integrator
+        """Gradient to depth."""
+        return self.solve.integrate
 
     def get_extra_state(self) -> Tensor:
         """Numbers that determine the output and are no parameters, such as gamma and the pitch: part of ``state_dict()``."""

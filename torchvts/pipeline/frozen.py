@@ -17,7 +17,7 @@ from ..core.checks import check_batch, check_image, check_path, check_range, che
 from ..core.files import MOST_TENSOR_BYTES, write_atomically
 from ..core.frame import Conditions, DepthOutput
 from .depth import DepthPipeline
-from .refine import Refine, SlopesOfDepth, SlopesOfPixels
+from .refine import Refine
 from .solve import Solve
 
 SHAPES = (1, 2, 3, 1, 1)
@@ -208,11 +208,8 @@ class FrozenPipeline:
             for k in frames:
                 self._frame(k, images, parts, conditions)
         else:
-            pool = ThreadPoolExecutor(threads, thread_name_prefix="torchvts")
-            try:  # each thread holds what it works on, so that nothing is freed under it
+            with ThreadPoolExecutor(threads, thread_name_prefix="torchvts") as pool:  # where one fails, no other begins
                 list(pool.map(lambda k: self._frame(k, images, parts, conditions), frames))
-            finally:
-                _finish(pool)
         unseen = torch.rad2deg(torch.atan(conditions[:, 21]))
         return DepthOutput(*parts), Conditions(conditions[:, :18].reshape(count, 3, 6), conditions[:, 18:21], unseen)
 
@@ -252,15 +249,6 @@ def _of_bytes(content: bytes) -> FrozenPipeline:
     return FrozenPipeline._of(Plan(content))
 
 
-def _finish(pool: ThreadPoolExecutor) -> None:
-    """Wait for the frames that are being worked on, which takes milliseconds, and leave out the others, whatever is raised."""
-    try:
-        pool.shutdown(wait=True, cancel_futures=True)
-    except KeyboardInterrupt:
-        _finish(pool)
-        raise
-
-
 def about(pipe: DepthPipeline) -> dict[str, object]:
     """What a plan says of itself: for people, and how its images lie in the frames of the camera."""
     made_by, sensor = f"torchvts {__version__} on {platform.system()} {platform.machine()}", pipe._sensor
@@ -295,10 +283,7 @@ def values_of(pipe: DepthPipeline) -> dict[str, Any]:
     compiled.check_solver("integrate", solve.integrate, pipe.mm_per_pixel)
     values |= compiled.mask_values(pipe.mask, size, pipe.takes_slopes)
     values |= compiled.zero_values(solve.zero, size) | compiled.contact_values(pipe.contact, size)
-    check_block("slopes", pipe.slopes, SlopesOfDepth, SlopesOfPixels)
-    if isinstance(pipe.slopes, SlopesOfDepth):
-        compiled.check_equal("slopes.mm_per_pixel", pipe.slopes.mm_per_pixel, pipe.mm_per_pixel)
-    values["slopes_of_depth"] = isinstance(pipe.slopes, SlopesOfDepth)
+    values["slopes_of_depth"] = pipe.slopes_of_depth
     check_block("refine", pipe.refine, Refine)
     if pipe.refine.solve is not solve:
         raise NotCompiled("refine.solve is not that of the pipeline")

@@ -38,7 +38,6 @@ class Shadows(nn.Module):
     Args:
         refine: of a pipeline of mode precise, by lights.
         mm_per_pixel: pixel pitch, mm.
-        rounds: how often pixels are classified again beside those that were accepted.
     Raises:
         TypeError: no :class:`Refine`. ValueError: one whose normals are not made of lights.
     Source:
@@ -53,7 +52,7 @@ class Shadows(nn.Module):
         torch.Size([1, 1, 48, 64])
     """
 
-    def __init__(self, refine: nn.Module, mm_per_pixel: float, rounds: int = 3) -> None:
+    def __init__(self, refine: nn.Module, mm_per_pixel: float) -> None:
         super().__init__()
         check_record("refine", refine, Refine, 'pipe.refine of DepthPipeline.from_calibration(calibration, "precise") is one')
         assert isinstance(refine, Refine)
@@ -66,7 +65,6 @@ class Shadows(nn.Module):
         self.mm_per_pixel = check_positive("mm_per_pixel", mm_per_pixel)
         # it cuts no edges, which would make a surface of any slopes
         self.residual_integrator: Integrator = PoissonBackground(self.mm_per_pixel)
-        self.rounds = rounds
 
     def forward(self, frame: Frame, solution: Solution) -> tuple[Frame, Solution]:
         blocked: Tensor = self.refine.solve.normals.shadowed.blocked(frame.image)
@@ -137,21 +135,14 @@ class Shadows(nn.Module):
             where: (B, 1, H, W) bool, the pixels in question.
             has_shadow: (B,) bool, the frames in question.
         """
-        taken = torch.zeros_like(where)
         if may_read_values() and not bool(where.any()):
-            return Accepted(taken, gradient)
+            return Accepted(where, gradient)
         slopes, others = gradient.detach(), other.detach()
         residual = self.residual(frame, slopes)
-        for _ in range(self.rounds):
-            gained = self.residual(frame, torch.where(where, others, slopes)) - residual
-            here = where & (nn.functional.avg_pool2d(gained, 17, 1, 8) < 0.0)
-            if may_read_values() and not bool(here.any()):
-                break
-            mixed = torch.where(here, others, slopes)
-            after = self.residual(frame, mixed)
-            better = (has_shadow & ((after - residual).sum(dim=(1, 2, 3)) < 0.0))[:, None, None, None]
-            slopes, residual = torch.where(better, mixed, slopes), torch.where(better, after, residual)
-            taken, where = taken | (here & better), where & ~here & better
+        gained = self.residual(frame, torch.where(where, others, slopes)) - residual
+        taken = where & (nn.functional.avg_pool2d(gained, 17, 1, 8) < 0.0)
+        after = self.residual(frame, torch.where(taken, others, slopes))
+        taken = taken & (has_shadow & ((after - residual).sum(dim=(1, 2, 3)) < 0.0))[:, None, None, None]
         return Accepted(taken, torch.where(taken, other, gradient))
 
     def better(self, has_shadow: Tensor, gained: Tensor, other: Solution, solution: Solution) -> Solution:

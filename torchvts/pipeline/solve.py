@@ -8,7 +8,6 @@ from torch import Tensor, nn
 
 from ..core.checks import reads_freely
 from ..core.frame import Frame, Solution
-from ..integration import Integrator
 from ..normals import NormalModel
 from ..normals.base import check_normals
 from .own_normals import doubt_of_axes
@@ -29,7 +28,7 @@ class Solve(nn.Module):
 
     calibrated: Final[bool]
 
-    def __init__(self, normals: NormalModel, gradient: nn.Module, integrate: Integrator, zero: nn.Module) -> None:
+    def __init__(self, normals: NormalModel, gradient: nn.Module, integrate: nn.Module, zero: nn.Module) -> None:
         super().__init__()
         self.normals = normals
         self.calibrated = normals.calibrated
@@ -65,7 +64,7 @@ class Solve(nn.Module):
     @torch.jit.export
     def integrated(self, frame: Frame, gradient: Tensor) -> Solution:
         """The solution of a gradient (B, 2, H, W) that is zero where the weight is."""
-        integrated = self.integrate(gradient)
+        integrated: Tensor = self.integrate(gradient)
         depth: Tensor = self.zero(integrated, frame.weight)
         if depth.shape != integrated.shape:
             raise ValueError(f"zero: expected depth {list(integrated.shape)} like that of integrate, got {list(depth.shape)}")

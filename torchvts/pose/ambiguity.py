@@ -11,6 +11,9 @@ from .rigid import Array, adjoint, rigid_motion
 SINE_OF_AXIS = 0.3
 """Sine of the angle to the z axis up to which a direction is called z, and of that to the skin up to which it has an angle."""
 
+SHIFT = 0.995
+"""A shift is free if so much of it lies in the free motions: of a ball of ten times the contact's radius, which rolls, it does."""
+
 LEAST_INFORMATION = 0.12
 """Squared change of slope, in units of its noise, per squared mm of motion, below which a motion is unknown: 0.02 a mm."""
 
@@ -45,7 +48,8 @@ def unknown_motions(grid: Grid, points: Points, noise: float) -> Array:
         points: all its pixels, whose twists they are.
         noise: of its slopes.
     """
-    free, shifts = free_directions(_information(points), information_of_noise(noise, grid.pitch), LEAST_INFORMATION)
+    information, bias = _information(points), information_of_noise(noise, grid.pitch)
+    free = free_directions(information, bias, LEAST_INFORMATION)
     depth = points.columns[2].numpy()
     deep = depth > DEEP * depth.max()
     if int(deep.sum()) < 6 or not _is_one_hill(grid):
@@ -54,6 +58,7 @@ def unknown_motions(grid: Grid, points: Points, noise: float) -> Array:
     part = points_of(grid, row, column, *center_and_units(grid.points(row, column)))
     motions = np.linalg.eigh(_information(part))[1]
     rolls = motions[:, _rolls(grid, part, motions)]
+    shifts = free_directions(information[3:, 3:], bias[3:, 3:], LEAST_INFORMATION)
     slides = np.concatenate((np.zeros_like(shifts), shifts))  # of the whole contact; a rod rolls and slides
     rolls = span(np.hstack((slides, rolls - slides @ (slides.T @ rolls))))
     return motions_of(points, rolls, part, np.eye(4)) if rolls.shape[1] > free.shape[1] else free
@@ -76,41 +81,36 @@ def information_of_noise(noise: float, pitch: float) -> Array:
     return np.diag(bend * np.array([0.1, 0.1, 1.0, 1.0, 1.0, 0.1]))
 
 
-def free_directions(information: Array, bias: Array, least: float) -> tuple[Array, Array]:
-    """Motions about which a surface holds hardly any information.
+def free_directions(information: Array, bias: Array, least: float) -> Array:
+    """Motions about which a surface holds hardly any information, orthonormal columns (6, k).
 
     Args:
         information: (6, 6), mean over the contact's pixels of J^T J in units of the noise; rotations in units of the contact's
             size, shifts in mm, so that all six are lengths.
         bias: (6, 6), the part of it that noise alone causes.
         least: information below which a direction counts as unknown, 1/mm^2.
-    Returns:
-        Orthonormal columns: all free motions (6, k), and those that are pure shifts (3, m).
     """
-    return _below(information, bias, least), _below(information[3:, 3:], bias[3:, 3:], least)
-
-
-def _below(information: Array, bias: Array, least: float) -> Array:
     values, vectors = np.linalg.eigh(information)
     noise = ((vectors.T @ bias) * vectors.T).sum(1)
     free: Array = vectors[:, values < least + 3.0 * noise]
     return free
 
 
-def name_directions(free: Array, shifts: Array) -> list[str]:
-    """Names of the motions that :func:`free_directions` found.
+def name_directions(free: Array) -> list[str]:
+    """Names of free motions, orthonormal columns (6, k).
 
     Example:
-        >>> name_directions(np.eye(6)[:, 2:5], np.eye(3)[:, :2])
+        >>> name_directions(np.eye(6)[:, 2:5])
         ['translation along x', 'translation along y', 'rotation about z']
-        >>> name_directions(np.eye(6)[:, :3], np.zeros((3, 0)))
+        >>> name_directions(np.eye(6)[:, :3])
         ['rotation about x', 'rotation about y', 'rotation about z']
-        >>> slide = np.array([[0.0, 0.0, 0.0, 0.8, 0.6, 0.0]]).T
-        >>> name_directions(slide, slide[3:])
+        >>> name_directions(np.array([[0.0, 0.0, 0.0, 0.8, 0.6, 0.0]]).T)
         ['translation along 37 degrees']
     """
-    names = []
-    count = min(shifts.shape[1], free.shape[1])
+    names: list[str] = []
+    directions, sizes, _ = np.linalg.svd(free[3:], full_matrices=False)
+    shifts = directions[:, sizes > SHIFT]
+    count = shifts.shape[1]
     if count == 1:
         names.append(f"translation along {_line(shifts[:, 0])}")
     elif count > 1:

@@ -5,19 +5,19 @@ import subprocess
 import sys
 import tempfile
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from ..core.checks import check_integer, check_path, check_positive, check_tensor
+from ..core.checks import check_integer, check_path, check_positive
 from ..core.geometry import depth_to_points
 from ..core.morphology import dilate
 from . import read_cloud
 from .grids import DepthFrame, least_depth_mm, slope_noise, surface_of
 from .output_frame import SENSOR_AXES
+from .points import checked_points
 from .surface_files import write_pcd, write_ply
 
 CLOUD_SUFFIXES = (".pcd", ".ply")
@@ -81,11 +81,10 @@ def write_point_cloud(path: str | Path, points: Tensor, normals: Tensor | None =
     path = check_path("path", path)
     if path.suffix.lower() not in CLOUD_SUFFIXES:
         raise ValueError(f"{path}: expected a name ending in {' or '.join(CLOUD_SUFFIXES)}, got {path.suffix!r}")
-    places, directions = _array("points", points, None), None if normals is None else _array("normals", normals, len(points))
-    if path.suffix.lower() == ".ply":
-        write_ply(path, places, directions, text)
-    else:
-        write_pcd(path, places, directions, text)
+    places = checked_points("points", points).numpy()
+    directions = None if normals is None else checked_points("normals", normals, len(places)).numpy()
+    write = write_ply if path.suffix.lower() == ".ply" else write_pcd
+    write(path, places, directions, text)
 
 
 def read_point_cloud(path: str | Path) -> tuple[Tensor, Tensor | None]:
@@ -139,14 +138,3 @@ def _read_apart(path: Path) -> tuple[Tensor | None, Tensor | None]:
         arrays = [Path(folder) / f"{name}.npy" for name in ("points", "normals")]
         points, normals = (torch.from_numpy(np.load(one)) if one.exists() else None for one in arrays)
     return points, normals
-
-
-def _array(name: str, values: Tensor, length: int | None) -> "np.ndarray[Any, Any]":
-    check_tensor(name, values)
-    if values.dim() != 2 or values.shape[1] != 3 or len(values) == 0 or (length is not None and len(values) != length):
-        raise ValueError(
-            f"{name}: expected ({'N' if length is None else length}, 3) with N above 0, got {tuple(values.shape)}: no contact?"
-        )
-    if not bool(torch.isfinite(values).all()):
-        raise ValueError(f"{name}: expected finite values, got NaN or infinite ones")
-    return values.detach().resolve_neg().cpu().double().numpy()

@@ -8,17 +8,18 @@ from dataclasses import replace
 
 import numpy as np
 import torch
+from numpy.linalg import inv
 from torch import Tensor
 
 from ..core.checks import check_least
 from ..core.geometry import check_rigid
-from .ambiguity import UNKNOWN_VARIANCE, motions_of, unknown_motions
+from .ambiguity import motions_of, unknown_motions
 from .follow import Followed, follow
 from .grids import DepthFrame, Grids, checked_grids, resolution_of, surface_of
 from .inverse import SLOPE_NOISE, Points, Score, bare_points, center_and_units, points_of, refine, score_pose
 from .keyframe import Keyframe, make_keyframe
 from .result import Registration
-from .rigid import Array, distance_mm, inverted, orthonormal, rotation_vector
+from .rigid import Array, distance_mm, orthonormal, rotation_vector
 from .search import search_plane
 
 MOST_TURNS, MOST_AGAIN = 4, 16
@@ -79,19 +80,15 @@ def register_depth(source: DepthFrame, target: DepthFrame, mm_per_pixel: float, 
         cause = "positions count from the image's middle, so a cropped frame lies elsewhere"
         raise ValueError(f"source: expected {sizes[1][0]} x {sizes[1][1]} like target, got {sizes[0][0]} x {sizes[0][1]}: {cause}")
     starts = [] if initial is None else [check_rigid("initial", initial).numpy()]
-    if starts and (near := follow(keyframe, frame, starts)).agrees:
+    if starts and not (near := follow(keyframe, frame, starts)).misfit:
         return _registration([near])
-    starts += likely_poses(keyframe, frame)
-    if not starts:
-        reason = "nothing fits: one of the contacts has no relief that could be compared"
-        spread = torch.eye(6, dtype=torch.float64) * UNKNOWN_VARIANCE
-        return Registration(torch.eye(4, dtype=torch.float64), math.inf, 0.0, False, reason, spread, [], [], 0.0)
+    starts += likely_poses(keyframe, frame) or [np.eye(4)]  # without relief no pose is more likely than another
     found = equal_poses(keyframe, frame, starts) or [follow(keyframe, frame, starts[:1])]
     row, column = frame.coarse.pixels()
     own = points_of(frame.coarse, row, column, *center_and_units(frame.coarse.points(row, column)))
-    unknown = unknown_motions(frame.coarse, own, resolution.noise)
-    if found[0].agrees and unknown.shape[1] > found[0].free.shape[1]:  # of real balls one frame in eight seems to show a rotation
-        held = motions_of(keyframe.many, unknown, own, inverted(found[0].pose))
+    unknown = unknown_motions(frame.coarse, own, resolution.noise)  # of real balls one frame in eight seems to show a rotation
+    if not found[0].misfit and unknown.shape[1] > found[0].free.shape[1]:
+        held = motions_of(keyframe.many, unknown, own, inv(found[0].pose))
         found = equal_poses(replace(keyframe, held=held), frame, [one.pose for one in found]) or found
     return _registration(found)
 
@@ -99,24 +96,14 @@ def register_depth(source: DepthFrame, target: DepthFrame, mm_per_pixel: float, 
 def _registration(found: list[Followed]) -> Registration:
     """The best pose, with the others that are equal to it."""
     best, poses = found[0], [torch.from_numpy(orthonormal(one.pose)) for one in found]
-    names, covariance = best.names if best.agrees else [], torch.from_numpy(best.covariance)
-    message = message_of(best.score, best.agrees)
+    names, covariance = [] if best.misfit else best.names, torch.from_numpy(best.covariance)
+    message = best.misfit or best.score.share
     if names:
         message += f"; the surface slides on itself: {', '.join(names)} unknown"
     if len(poses) > 1:
         message += f"; {len(poses) - 1} more poses fit as well: the object is symmetric"
     fitness, overlap, _ = best.score
-    return Registration(poses[0], best.fine.depth_noise, fitness, best.agrees, message, covariance, names, poses[1:], overlap)
-
-
-def message_of(score: Score, agrees: bool) -> str:
-    """A score in words."""
-    common = f"{100 * score.fitness:.0f} % of the common contact agrees, which is {100 * score.overlap:.0f} % of the smaller one"
-    if agrees:
-        return common
-    if score.is_enough(math.inf):
-        return f"nothing fits well: {common}, but all of it differs: different objects, or slopes that err by degrees"
-    return f"nothing fits: {common}: different objects, or parts of one that hardly overlap"
+    return Registration(poses[0], best.fine.depth_noise, fitness, not best.misfit, message, covariance, names, poses[1:], overlap)
 
 
 def likely_poses(keyframe: Keyframe, frame: Grids) -> list[Array]:
@@ -199,20 +186,20 @@ def equal_poses(keyframe: Keyframe, frame: Grids, starts: list[Array], motions: 
         tried.append(start)
         one = follow(keyframe, frame, [start])
         known = [other.pose for other in found]
-        if not one.agrees or not is_new(one.pose, known):
+        if one.misfit or not is_new(one.pose, known):
             continue
         found.append(one)
         if one.names:  # products of symmetries would differ by what is unknown: only what turns it otherwise is another pose
             poses = [*(one.pose @ motion for motion in motions), *waiting]
             others = [follow(keyframe, frame, [poses[k]]) for k in turned_otherwise(poses, one)]
-            others = [other for other in others if other.agrees]
+            others = [other for other in others if not other.misfit]
             found += [others[k] for k in turned_otherwise([other.pose for other in others], one)]
             break
         if not known:
             waiting.extend(one.pose @ motion for motion in motions)
         first = (known or [one.pose])[0]
         waiting.extend(
-            a @ inverted(first) @ b for a, b in itertools.product([*known, one.pose], repeat=2) if a is one.pose or b is one.pose
+            a @ inv(first) @ b for a, b in itertools.product([*known, one.pose], repeat=2) if a is one.pose or b is one.pose
         )
     if not found:
         return []
@@ -220,7 +207,7 @@ def equal_poses(keyframe: Keyframe, frame: Grids, starts: list[Array], motions: 
     best = found[0]
 
     def is_equal(one: Followed) -> bool:
-        motion = inverted(best.pose) @ one.pose
+        motion = inv(best.pose) @ one.pose
         return _equals(one.fine.cost, best.fine.cost) or (
             _equals(one.score.cost, best.score.cost) and not is_new(motion, list(motions))
         )

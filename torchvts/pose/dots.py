@@ -1,11 +1,12 @@
 """How an object moves between two frames by printed dots: skin that sticks to it moves with it."""
 
 import numpy as np
+from numpy.linalg import inv
 from torch import Tensor
 
 from ..core.checks import check_record
 from ..skin import DotMotion
-from .rigid import Array, cross, inverted, rigid_motion, rotation_vector
+from .rigid import Array, cross, rigid_motion, rotation_vector
 
 FEWEST = 4
 """Dots under the object in both frames at least."""
@@ -45,11 +46,11 @@ def carried(before: Array, after: Array) -> tuple[Array, Array] | None:
         weight = deep / (1.0 + (off / (2.0 * max(float(np.median(off)), 1e-4))) ** 2)
     by_twist = np.concatenate((-cross(after), np.broadcast_to(np.eye(3), (len(after), 3, 3))), 2)  # (N, 3, 6)
     information = np.einsum("n,nij,nik->jk", weight / weight.max(), by_twist, by_twist)
-    return motion, max(float(np.average(off**2, weights=weight)), 1e-8) * np.linalg.inv(information)
+    return motion, max(float(np.average(off**2, weights=weight)), 1e-8) * inv(information)
 
 
 def fused(pose: Array, covariance: Array, other: Array, of_other: Array) -> tuple[Array, Array]:
     """The mean of two independent poses (4, 4), and its covariance (6, 6), as small motions after them (Kalman)."""
-    gain, between = covariance @ np.linalg.inv(covariance + of_other), other @ inverted(pose)
+    gain, between = covariance @ inv(covariance + of_other), other @ inv(pose)
     step = gain @ np.concatenate((rotation_vector(between[:3, :3]), between[:3, 3]))
     return rigid_motion(step, np.zeros(3)) @ pose, covariance - gain @ covariance

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .ambiguity import LEAST_INFORMATION, UNKNOWN_VARIANCE, free_directions, name_directions, span
+from .ambiguity import LEAST_INFORMATION, UNKNOWN_VARIANCE, free_directions, information_of_noise, name_directions, span
 from .grids import Grids
 from .height_errors import covariance_with_heights, height_sums
 from .inverse import (
@@ -15,7 +15,6 @@ from .inverse import (
     Score,
     Sums,
     bare_points,
-    covariance_after,
     moved_by,
     refine,
     score_pose,
@@ -25,7 +24,7 @@ from .inverse import (
     sum_residuals,
 )
 from .keyframe import Keyframe
-from .rigid import Array
+from .rigid import Array, moved_covariance
 from .uncertainty import LEAST_SLOPE_NOISE, PARTS, covariance_of_slopes
 
 MOST_STEPS = 30
@@ -74,9 +73,13 @@ class Followed(NamedTuple):
     covariance: Array
 
     @property
-    def agrees(self) -> bool:
-        """Whether the frames agree well enough on a large enough part, and show any motion."""
-        return self.free.shape[1] < 6 and self.score.is_enough()
+    def misfit(self) -> str:
+        """Why the pose is none, in words; empty if the frames agree well enough on a large enough part, and show any motion."""
+        if self.score.is_enough():
+            return "the contact is too small: no motion of it is known" if self.free.shape[1] == 6 else ""
+        if self.score.is_enough(math.inf):
+            return f"nothing fits well: {self.score.share}, but all of it differs: different objects, or slopes that err by degrees"
+        return f"nothing fits: {self.score.share}: different objects, or parts of one that hardly overlap"
 
     @property
     def exact(self) -> bool:
@@ -89,15 +92,16 @@ def follow(keyframe: Keyframe, frame: Grids, starts: list[Array]) -> Followed:
 
     Motions that the contact does not determine keep their value in the first of the poses, the last one of the track.
     """
-    costs = [sum_residuals(frame.coarse, keyframe.coarse, start, SLOPE_NOISE, score_only=True).cost for start in starts]
-    best = costs.index(min(costs))
-    first = _follow_from(keyframe, frame, starts[best], starts[0])
-    if not first.agrees:
-        for start in starts[:best] + starts[best + 1 :]:
-            other = _follow_from(keyframe, frame, start, starts[0])
-            if other.agrees:
-                return other
-    return first
+
+    def cost(start: Array) -> float:
+        return sum_residuals(frame.coarse, keyframe.coarse, start, SLOPE_NOISE, score_only=True).cost
+
+    tried: list[Followed] = []
+    for start in sorted(starts, key=cost):
+        tried.append(_follow_from(keyframe, frame, start, starts[0]))
+        if not tried[-1].misfit:
+            return tried[-1]
+    return tried[0]
 
 
 def _follow_from(keyframe: Keyframe, frame: Grids, start: Array, last: Array) -> Followed:
@@ -105,32 +109,32 @@ def _follow_from(keyframe: Keyframe, frame: Grids, start: Array, last: Array) ->
     pose, coarse = refine(frame.coarse, keyframe.coarse, start, MOST_STEPS, 2.0 * SLOPE_NOISE, keyframe.held, SMALL_MM)
     unknown = _sliding(keyframe, coarse)
     pose = _kept(keyframe, unknown, last, pose)
-    refined, some = refine(frame.fine, keyframe.some, pose, MOST_STEPS, SLOPE_NOISE, unknown.motions, SMALLEST_MM)
+    refined, some = refine(frame.fine, keyframe.some, pose, MOST_STEPS, SLOPE_NOISE, unknown, SMALLEST_MM)
     vague = _vague(keyframe, some)
-    if vague.motions.shape[1] > 0:
-        unknown = _joined(unknown, vague)
+    if vague.shape[1] > 0:
+        unknown = span(np.hstack((unknown, vague)))
         pose = _kept(keyframe, unknown, last, pose)
-        refined, some = refine(frame.fine, keyframe.some, pose, MOST_STEPS, SLOPE_NOISE, unknown.motions, SMALLEST_MM)
+        refined, some = refine(frame.fine, keyframe.some, pose, MOST_STEPS, SLOPE_NOISE, unknown, SMALLEST_MM)
     noise = max(LEAST_NOISE, 1.5 * some.slope_noise)
     fine, matrices, rights = sum_parts(frame.fine, keyframe.many, refined, noise, PARTS)
-    by_slopes = solve_step(fine, unknown.motions)
-    scaled = covariance_of_slopes(fine, matrices, rights, keyframe.shared_error, unknown.motions)
+    by_slopes = solve_step(fine, unknown)
+    scaled = covariance_of_slopes(fine, matrices, rights, keyframe.shared_error, unknown)
     step = by_slopes
-    if unknown.motions.shape[1] == 0:
+    if unknown.shape[1] == 0:
         fine, both = _with_heights(fine, keyframe, frame, refined)
         step, scaled = solve_step(both), covariance_with_heights(fine, both, scaled)
     scaled[5, 5] += fine.depth_noise**2 + HEIGHT_OFFSET_MM**2
-    pose = _kept(keyframe, unknown, last, refined @ moved_by(keyframe.many, step))
+    pose, origin = _kept(keyframe, unknown, last, refined @ moved_by(keyframe.many, step)), keyframe.many.to_origin()
     return Followed(
         pose=pose,
         fine=fine,
         score=score_pose(frame.coarse, keyframe.coarse, keyframe.grids.coarse, bare_points(frame.coarse), pose),
-        free=unknown.motions,
-        names=_names(unknown, pose),
+        free=unknown,
+        names=name_directions(np.vstack((pose[:3, :3] @ unknown[:3], pose[:3, :3] @ unknown[3:]))),
         std_deg=math.degrees(math.sqrt(float(np.diag(scaled)[:3] @ keyframe.many.units[:3] ** 2))),
         std_mm=math.sqrt(float(np.trace(scaled[3:, 3:]))),
         settled=float(np.linalg.norm(by_slopes)) < SMALL_MM,
-        covariance=covariance_after(keyframe.many, pose, scaled + unknown.motions @ unknown.motions.T * UNKNOWN_VARIANCE),
+        covariance=moved_covariance(pose, origin @ (scaled + unknown @ unknown.T * UNKNOWN_VARIANCE) @ origin.T),
     )
 
 
@@ -158,53 +162,28 @@ def in_common(keyframe: Keyframe, frame: Grids, pose: Array) -> tuple[float, flo
     return share, float(np.trace(np.linalg.inv(information)))
 
 
-class _Unknown(NamedTuple):
-    """Scaled twists (6, k) that are not determined, and those among them that are pure shifts (3, m); orthonormal columns."""
-
-    motions: Array
-    shifts: Array
-
-
-def _kept(keyframe: Keyframe, unknown: _Unknown, last: Array, pose: Array) -> Array:
+def _kept(keyframe: Keyframe, unknown: Array, last: Array, pose: Array) -> Array:
     """The pose (4, 4), moved by what is unknown to where that has its last value, as :func:`solve_step` has it: rotations first."""
-    motions = unknown.motions
-    if motions.shape[1] == 0:
+    if unknown.shape[1] == 0:
         return pose
     step = step_between(keyframe.many, last, pose)
-    damping = motions.T * ROTATION_FIRST
-    kept: Array = last @ moved_by(keyframe.many, step - motions @ np.linalg.solve(damping @ motions, damping @ step))
+    damping = unknown.T * ROTATION_FIRST
+    kept: Array = last @ moved_by(keyframe.many, step - unknown @ np.linalg.solve(damping @ unknown, damping @ step))
     return kept
 
 
-def _sliding(keyframe: Keyframe, coarse: Sums) -> _Unknown:
+def _sliding(keyframe: Keyframe, coarse: Sums) -> Array:
     """Motions under which the common contact slides on itself, by its information, and those that the keyframe may roll by."""
     information = coarse.matrix * ((coarse.noise / SLOPE_NOISE) ** 2 / max(coarse.used, 1))
-    free, shifts = free_directions(information, keyframe.bias, LEAST_INFORMATION)
-    return (
-        _joined(_Unknown(free, shifts), _Unknown(keyframe.held, shifts)) if keyframe.held.shape[1] > 0 else _Unknown(free, shifts)
-    )
+    bias = information_of_noise(keyframe.resolution.noise, keyframe.grids.coarse.pitch)
+    return span(np.hstack((free_directions(information, bias, LEAST_INFORMATION), keyframe.held)))
 
 
-def _vague(keyframe: Keyframe, some: Sums) -> _Unknown:
+def _vague(keyframe: Keyframe, some: Sums) -> Array:
     """Motions whose standard deviation is too large, because the common contact is small or faint."""
     wanted = np.concatenate((math.radians(TRUSTED_DEG) / keyframe.some.units[:3], np.full(3, TRUSTED_MM)))
     alike = max(1.0, ALIKE_PIXELS * keyframe.some.number / keyframe.grids.touching)
     ratio = max(some.slope_noise, LEAST_SLOPE_NOISE) / some.noise
     matrix = some.matrix * wanted[:, None] * wanted / (alike * ratio**2)
-
-    def below(part: Array, scale: Array) -> Array:
-        precision, directions = np.linalg.eigh(part)  # 1 where the standard deviation is as wanted
-        return np.linalg.qr(directions[:, precision < 1.0] * scale[:, None])[0]
-
-    return _Unknown(below(matrix, wanted), below(matrix[3:, 3:], wanted[3:]))
-
-
-def _joined(one: _Unknown, other: _Unknown) -> _Unknown:
-    """All motions that are in one or the other."""
-    return _Unknown(span(np.hstack((one.motions, other.motions))), span(np.hstack((one.shifts, other.shifts))))
-
-
-def _names(unknown: _Unknown, pose: Array) -> list[str]:
-    """Names of the motions in the frame's axes."""
-    turn, motions = pose[:3, :3], unknown.motions
-    return name_directions(np.vstack((turn @ motions[:3], turn @ motions[3:])), turn @ unknown.shifts) if motions.shape[1] else []
+    precision, directions = np.linalg.eigh(matrix)  # 1 where the standard deviation is as wanted
+    return np.linalg.qr(directions[:, precision < 1.0] * wanted[:, None])[0]

@@ -7,8 +7,10 @@ import numpy as np
 import numpy.typing as npt
 import torch
 from torch import Tensor
+from torch.nn.functional import avg_pool2d
 
 from ..compiled import library, tracking
+from ..core.morphology import dilate
 from .rigid import Array
 
 LEAST_DEPTH_MM = 0.03
@@ -25,8 +27,6 @@ LEAST_ALIKE = 0.3
 
 Image = npt.NDArray[Any]
 Mask = npt.NDArray[Any]
-
-_NEIGHBOURS = np.ones((3, 3), np.uint8)
 
 
 class DepthFrame(Protocol):
@@ -198,11 +198,9 @@ def checked_grids(surface: Surface, mm_per_pixel: float, resolution: Resolution,
 
 def grids(surface: Surface, mm_per_pixel: float, resolution: Resolution) -> Grids:
     """Both grids of a frame."""
-    if library() is None:
-        return _grids_by_opencv(surface, mm_per_pixel, resolution)
     height, width = surface.depth_mm.shape[-2:]
-    parts = (surface.depth_mm, surface.gradient, surface.contact)
-    *made, touching = tracking.track_grids(*parts, resolution.least_mm, resolution.times)
+    by = tracking.track_grids if library() is not None else track_grids
+    *made, touching = by(surface.depth_mm, surface.gradient, surface.contact, resolution.least_mm, resolution.times)
     fine, coarse = (
         Grid(channels, (n - width) * 0.5 * mm_per_pixel, (height - n) * 0.5 * mm_per_pixel, n * mm_per_pixel)
         for channels, n in zip(made, resolution.times, strict=True)
@@ -210,46 +208,25 @@ def grids(surface: Surface, mm_per_pixel: float, resolution: Resolution) -> Grid
     return Grids(fine, coarse, touching)
 
 
-def _grids_by_opencv(surface: Surface, mm_per_pixel: float, resolution: Resolution) -> Grids:
-    import cv2
+def track_grids(
+    depth: Tensor, slopes: Tensor, contact: Tensor, least_mm: float, times: tuple[int, int]
+) -> tuple[Tensor, Tensor, int]:
+    """Channels of both grids, and how many fine pixels lie on the object: ``compiled.tracking.track_grids`` in the plain way."""
+    inside = contact & (depth > least_mm)
+    perhaps = contact | (depth > 0.3 * float(depth.max()))  # flat faces that the image border cuts may be missing from the mask
+    values = torch.cat((depth, slopes[:, :1], -slopes[:, 1:]), 1)
 
-    z, contact = surface.depth_mm[0, 0].numpy(), surface.contact[0, 0].numpy().view(np.uint8)
-    p, q = surface.gradient[0].numpy()
-    height, width = z.shape
-    grid = (-0.5 * (width - 1) * mm_per_pixel, 0.5 * (height - 1) * mm_per_pixel, mm_per_pixel)
-    inside = contact & (z > resolution.least_mm)
-    perhaps = contact | (z > 0.3 * float(z.max()))  # flat faces whose outline the image border cuts may be missing from the mask
-    up = -q
-    if resolution.times[0] > 1:
-        fine = _pooled((z, p, up), inside, perhaps, resolution.times[0], grid, 0.99)
-    else:
-        mask = cv2.addWeighted(cv2.erode(inside, _NEIGHBOURS), 0.75, cv2.dilate(perhaps, _NEIGHBOURS), 0.25, 0.0, dtype=cv2.CV_32F)
-        fine = Grid(torch.from_numpy(cv2.merge((z, p, up, mask))), *grid)
-    coarse = _pooled((z, p, up), inside, perhaps, resolution.times[1], grid, 0.5)
-    return Grids(fine, coarse, int(torch.count_nonzero(fine.channels[..., 3] > 0.999)))
+    def pooled(n: int, least: float) -> Tensor:
+        """Means over the part of each cell of n x n pixels that lies on the object, which must be more than a share of it."""
+        part = avg_pool2d(inside.float(), n)
+        near = dilate(avg_pool2d(perhaps.float(), n) > 0.01)
+        mask = torch.where(part > least, 1.0, 0.25 * near.float())
+        return torch.cat((avg_pool2d(values * inside, n) / part.clamp_min(0.01), mask), 1)
 
-
-def _pooled(
-    values: tuple[Image, Image, Image], inside: Mask, perhaps: Mask, times: int, grid: tuple[float, float, float], share: float
-) -> Grid:
-    """Means over the part of each cell of ``times`` x ``times`` pixels that lies on the object, which must be ``share`` of it."""
-    import cv2
-
-    x0, y0, pitch = grid
-    rows, columns = (length // times * times for length in inside.shape)
-    size = (columns // times, rows // times)
-
-    def mean(one: Image) -> Image:
-        return cv2.resize(one[:rows, :columns], size, interpolation=cv2.INTER_AREA)
-
-    within = inside.astype(np.float32)
-    part = mean(within)
-    scale = 1.0 / np.maximum(part, 0.01)
-    near = cv2.dilate((mean(perhaps.astype(np.float32)) > 0.01).astype(np.float32), _NEIGHBOURS)
-    means = [mean(cv2.multiply(one, within)) * scale for one in values]
-    channels = cv2.merge((*means, np.where(part > share, np.float32(1.0), np.float32(0.25) * near)))
-    half = 0.5 * (times - 1) * pitch
-    return Grid(torch.from_numpy(channels), x0 + half, y0 - half, times * pitch)
+    whole = torch.cat((values, 0.75 * (~dilate(~inside)).float() + 0.25 * dilate(perhaps).float()), 1)
+    made = (whole if times[0] == 1 else pooled(times[0], 0.99), pooled(times[1], 0.5))
+    fine, coarse = (one[0].permute(1, 2, 0).contiguous() for one in made)
+    return fine, coarse, int(torch.count_nonzero(fine[..., 3] > 0.999))
 
 
 def least_depth_mm(noise: float, mm_per_pixel: float) -> float:

@@ -10,11 +10,12 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from numpy.linalg import inv
 from torch import Tensor
 
 from ..compiled import library, tracking
 from .grids import Grid, Image, Mask
-from .rigid import Array, adjoint, cross, inverted, rigid_motion, rotation_vector
+from .rigid import Array, cross, rigid_motion, rotation_vector
 
 SLOPE_NOISE = 0.06
 """Disagreement of slopes that counts as noise, mm per mm: calibrated sensors err by 2 to 3 degrees, exact ones by less."""
@@ -111,6 +112,12 @@ class Score(NamedTuple):
     def is_enough(self, most_cost: float = MOST_COST) -> bool:
         """Whether the pose can be trusted."""
         return self.fitness >= LEAST_FITNESS and self.overlap >= LEAST_OVERLAP and self.cost <= most_cost
+
+    @property
+    def share(self) -> str:
+        """What was compared, in words."""
+        common = f"{100 * self.fitness:.0f} % of the common contact agrees"
+        return f"{common}, which is {100 * self.overlap:.0f} % of the smaller one"
 
 
 def center_and_units(points: Image) -> tuple[Array, Array]:
@@ -214,7 +221,7 @@ def moved_by(points: Points, step: Array) -> Array:
 
 def step_between(points: Points, pose: Array, other: Array) -> Array:
     """The scaled twist (6,) after which, by :func:`moved_by`, a pose (4, 4) is another one."""
-    moved = inverted(pose) @ other
+    moved = inv(pose) @ other
     turn = moved[:3, :3]
     twist = np.concatenate((rotation_vector(turn), moved[:3, 3] - points.center + turn @ points.center))
     step: Array = twist / points.units
@@ -224,7 +231,7 @@ def step_between(points: Points, pose: Array, other: Array) -> Array:
 def score_pose(grid: Grid, points: Points, own_grid: Grid, own_points: Points, pose: Array) -> Score:
     """Score of a pose of ``points`` in ``grid``, and back, of the new frame's own points in the reference's ``own_grid``."""
     forth = sum_residuals(grid, points, pose, SLOPE_NOISE, score_only=True)
-    back = sum_residuals(own_grid, own_points, inverted(pose), SLOPE_NOISE, score_only=True)
+    back = sum_residuals(own_grid, own_points, inv(pose), SLOPE_NOISE, score_only=True)
     compared = max(forth.compared + back.compared, 1.0)
     fitness = (forth.fitness * forth.compared + back.fitness * back.compared) / compared
     overlap = max(forth.compared / max(points.number, 1), back.compared / max(own_points.number, 1))
@@ -233,21 +240,22 @@ def score_pose(grid: Grid, points: Points, own_grid: Grid, own_points: Points, p
 
 def sum_residuals(grid: Grid, points: Points, pose: Array, slope_noise: float, score_only: bool = False) -> Sums:
     """Sums of one Gauss-Newton step with Cauchy's weights, and the score of the pose (4, 4), from the reference to the grid."""
-    by = tracking.alignment_sums if library() is not None else alignment_sums
-    return sums_of(by(grid.channels, points.columns, residual_limits(grid, pose, slope_noise), score_only), slope_noise)
+    found = _alignment_sums(grid.channels, points.columns, residual_limits(grid, pose, slope_noise), score_only)
+    return sums_of(found, slope_noise)
 
 
 def sum_parts(grid: Grid, points: Points, pose: Array, slope_noise: float, parts: int) -> tuple[Sums, Array, Array]:
     """:func:`sum_residuals`, and the matrices (parts, 6, 6) and right sides (parts, 6) of as many runs of pixels."""
-    limits = residual_limits(grid, pose, slope_noise)
-    if library() is not None:
-        found = tracking.part_sums(grid.channels, points.columns, parts, limits)
-    else:
-        ends = [points.number * k // parts for k in range(parts + 1)]
-        runs = [points.columns[:, first:end] for first, end in pairwise(ends)]
-        found = np.stack([alignment_sums(grid.channels, run, limits) for run in runs])
+    limits, ends = residual_limits(grid, pose, slope_noise), [points.number * k // parts for k in range(parts + 1)]
+    found = np.stack([_alignment_sums(grid.channels, points.columns[:, a:b], limits) for a, b in pairwise(ends)])
     products = found[:, :49].reshape(parts, 7, 7)
     return sums_of(found.sum(0), slope_noise), products[:, :6, :6], products[:, :6, 6]
+
+
+def _alignment_sums(channels: Tensor, columns: Tensor, limits: Array, score_only: bool = False) -> Array:
+    """:func:`alignment_sums`, in C where there is a library."""
+    by = tracking.alignment_sums if library() is not None else alignment_sums
+    return by(channels, columns, limits, score_only)
 
 
 def residual_limits(grid: Grid, pose: Array, slope_noise: float) -> Array:
@@ -320,10 +328,3 @@ def alignment_sums(channels: Tensor, columns: Tensor, limits: Array, score_only:
         products = np.einsum("rin,rn,rkn->ik", lines, scale, lines, optimize=True)
     score = [used.sum(), weight.sum(), (weight * off).sum(), (weight * high).sum(), error.sum(), (error < 1.0).sum(), counted.sum()]
     return np.concatenate((products.ravel(), np.array(score, np.float64)))
-
-
-def covariance_after(points: Points, pose: Array, scaled: Array) -> Array:
-    """Covariance of a small motion after the pose, rad and mm, from that of a scaled twist before it."""
-    after = adjoint(pose) @ points.to_origin()
-    covariance: Array = after @ scaled @ after.T
-    return covariance

@@ -4,12 +4,13 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from numpy.linalg import inv
 
-from .ambiguity import information_of_noise, unknown_motions
+from .ambiguity import unknown_motions
 from .grids import Grids, Resolution, Surface, checked_grids, resolution_of
 from .height_errors import HeightErrors, height_errors
 from .inverse import FINE_WINDOW, Points, center_and_units, points_of
-from .rigid import Array, inverted, moved_covariance, orthonormal, rotation_vector
+from .rigid import Array, moved_covariance, orthonormal, rotation_vector
 from .uncertainty import PARTS, in_parts, shared_error
 
 SOME, MANY = 2000, 8000
@@ -34,7 +35,6 @@ class Keyframe:
         heights: cells of ``some``, and how their heights err.
         spread: (4, 4), mean of the products of points (x, y, z, 1) of the contact, mm.
         held: (6, k) scaled twists that the whole contact does not determine.
-        bias: (6, 6), the part of the information of a coarse pixel that noise causes.
         shared_error: how many times larger the variance of a pose is than its parts show.
     """
 
@@ -46,7 +46,6 @@ class Keyframe:
     heights: HeightErrors
     spread: Array
     held: Array
-    bias: Array
     shared_error: float
 
     @cached_property
@@ -87,7 +86,6 @@ def make_keyframe(surface: Surface, mm_per_pixel: float, name: str = "reference"
         heights=height_errors(surface.gradient, surface.skin, mm_per_pixel, CELL * resolution.times[1], some),
         spread=few @ few.T / few.shape[1],
         held=unknown_motions(made.coarse, coarse, resolution.noise),
-        bias=information_of_noise(resolution.noise, made.coarse.pitch),
         shared_error=shared_error(many.columns[:2].double().numpy().T, PARTS),
     )
 
@@ -121,7 +119,7 @@ class KeyframeGraph:
         """
         by_loop = orthonormal(pose @ self.poses[source])
         spread = covariance + moved_covariance(pose, self.covariances[source])
-        off = self.poses[index] @ inverted(by_loop)
+        off = self.poses[index] @ inv(by_loop)
         if np.trace(spread) < np.trace(self.covariances[index]):
             self.poses[index], self.covariances[index] = by_loop, spread
         return np.concatenate((rotation_vector(off[:3, :3]), off[:3, 3]))

@@ -2,11 +2,12 @@
 
 import numpy as np
 import torch
+from numpy.linalg import inv
 from torch import Tensor
 
 from ..core.checks import check_choice
 from ..model import Sensor, check_sensor
-from .rigid import adjoint, inverted, orthonormal
+from .rigid import adjoint, orthonormal
 
 MM_OF = {"mm": 1.0, "m": 1000.0}
 """Units of length, in mm."""
@@ -52,7 +53,7 @@ class OutputFrame:
 
     def pose(self, T_target_source: Tensor) -> Tensor:
         """The same motion (4, 4) of points of this frame."""
-        T = self._from_sensor @ T_target_source.numpy() @ inverted(self._from_sensor)
+        T = self._from_sensor @ T_target_source.numpy() @ inv(self._from_sensor)
         T[:3, 3] /= self.mm
         return torch.from_numpy(T)
 

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..core.checks import check_float_tensor, check_tensor
+from ..core.checks import check_float_tensor
 from ..core.geometry import check_rigid
 from .ambiguity import UNKNOWN_VARIANCE, free_directions, name_directions
 from .read_cloud import open3d
@@ -83,23 +83,27 @@ def register_points(
         return _refined(o3d, moving, fixed, _by_features(o3d, moving, fixed))
 
 
-def _checked(name: str, points: Tensor, normals: Tensor | None) -> tuple[Tensor, Tensor | None]:
-    """Points and normals in float64 without duplicate points, or raise."""
-    check_float_tensor(name, points)
-    if points.dim() != 2 or points.shape[1] != 3:
-        raise ValueError(f"{name}: expected (N, 3), got {tuple(points.shape)}")
-    if len(points) == 0:
+def checked_points(name: str, values: Tensor, number: int | None = None) -> Tensor:
+    """Points or normals (N, 3) in float64 on the CPU, as many as are asked for, or raise."""
+    check_float_tensor(name, values)
+    if values.dim() != 2 or values.shape[1] != 3 or number not in (None, len(values)):
+        raise ValueError(f"{name}: expected ({'N' if number is None else number}, 3), got {tuple(values.shape)}")
+    if len(values) == 0:
         raise ValueError(f"{name}: expected points, got none: no contact?")
-    points = points.detach().resolve_neg().cpu().double()
-    if not bool(torch.isfinite(points).all()):
-        raise ValueError(f"{name}: expected finite points, got {int((~torch.isfinite(points)).any(1).sum())} with NaN or infinity")
+    values = values.detach().resolve_neg().cpu().double()
+    if not bool(torch.isfinite(values).all()):
+        number = int((~torch.isfinite(values)).any(1).sum())
+        raise ValueError(f"{name}: expected finite values, got {number} lines with NaN or infinity")
+    return values
+
+
+def _checked(name: str, points: Tensor, normals: Tensor | None) -> tuple[Tensor, Tensor | None]:
+    """Points without duplicates, and unit normals, or raise."""
+    points = checked_points(name, points)
     if normals is not None:
-        check_tensor(f"{name}_normals", normals)
-        if tuple(normals.shape) != tuple(points.shape):
-            raise ValueError(f"{name}_normals: expected {tuple(points.shape)} like the points, got {tuple(normals.shape)}")
-        normals = torch.nn.functional.normalize(normals.detach().cpu().double(), dim=1)
-        if not bool((normals.norm(dim=1) > 0.5).all()):  # NaN too
-            raise ValueError(f"{name}_normals: expected finite normals, got NaN, infinite or zero ones")
+        normals = torch.nn.functional.normalize(checked_points(f"{name}_normals", normals, len(points)), dim=1)
+        if not bool((normals.norm(dim=1) > 0.5).all()):
+            raise ValueError(f"{name}_normals: expected unit normals, got some of no length")
     first = np.sort(np.unique(points.numpy(), axis=0, return_index=True)[1])
     if len(first) < LEAST_POINTS:
         raise ValueError(f"{name}: expected at least {LEAST_POINTS} distinct points, got {len(first)} of {len(points)}")
@@ -174,7 +178,7 @@ def _determined(points: Array, normal: Array, rmse_mm: float) -> tuple[list[str]
     middle = points - points.mean(0)
     units = np.array([1.0 / math.sqrt(float(np.square(middle).sum(1).mean()))] * 3 + [1.0] * 3)
     jacobian = np.hstack((np.cross(middle, normal), normal)) * units
-    free, shifts = free_directions(jacobian.T @ jacobian / len(jacobian), np.zeros((6, 6)), LEAST_INFORMATION)
+    free = free_directions(jacobian.T @ jacobian / len(jacobian), np.zeros((6, 6)), LEAST_INFORMATION)
     about_origin = np.hstack((np.cross(points, normal), normal))
     known = about_origin.T @ about_origin * (min(1.0, ALIKE_POINTS / len(points)) / max(rmse_mm, 1e-6) ** 2)
-    return name_directions(free, shifts), torch.from_numpy(np.linalg.inv(known + np.diag([1.0] * 3 + [0.01] * 3)))
+    return name_directions(free), torch.from_numpy(np.linalg.inv(known + np.diag([1.0] * 3 + [0.01] * 3)))

@@ -5,8 +5,6 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from .rigid import rigid_motion
-
 
 @dataclass(frozen=True, eq=False)
 class Registration:
@@ -38,23 +36,5 @@ class Registration:
 
     def inverse(self) -> Tensor:
         """T_source_target (4, 4)."""
-        return invert(self.T_target_source)
-
-
-def invert(T: Tensor) -> Tensor:
-    """Inverse of rigid motions (..., 4, 4)."""
-    inverse: Tensor = torch.linalg.inv(T)
-    return inverse
-
-
-def motion(twist: Tensor, center: Tensor | None = None) -> Tensor:
-    """Rigid motions (..., 4, 4) of twists (..., 6): rotation by w about ``center`` (default: the origin), then shift by t."""
-    about = torch.zeros(3, dtype=torch.float64) if center is None else center
-    return torch.from_numpy(rigid_motion(twist.double().numpy(), about.double().numpy())).to(twist.dtype)
-
-
-def turn_deg(T: Tensor) -> Tensor:
-    """Rotation angle of rigid motions (..., 4, 4), degrees; accurate for small angles too."""
-    r = T[..., :3, :3]
-    skew = torch.stack((r[..., 2, 1] - r[..., 1, 2], r[..., 0, 2] - r[..., 2, 0], r[..., 1, 0] - r[..., 0, 1]), -1)
-    return torch.rad2deg(torch.atan2(skew.norm(dim=-1), r.diagonal(dim1=-2, dim2=-1).sum(-1) - 1.0))
+        inverse: Tensor = torch.linalg.inv(self.T_target_source)
+        return inverse

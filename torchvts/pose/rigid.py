@@ -21,12 +21,6 @@ def rigid_motion(twist: Array, center: Array) -> Array:
     return result
 
 
-def inverted(pose: Array) -> Array:
-    """The inverse of a rigid motion (4, 4)."""
-    result: Array = np.linalg.inv(pose)
-    return result
-
-
 def rotation_vector(turn: Array) -> Array:
     """Axis times angle (3,) of a rotation (3, 3) of at most half a turn."""
     skew = 0.5 * np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
@@ -41,15 +35,10 @@ def rotation_vector(turn: Array) -> Array:
 
 
 def orthonormal(pose: Array) -> Array:
-    """The pose (4, 4) with its nearly right rotation made exact: products of poses multiply what is missing.
-
-    Source:
-        Newton-Schulz steps to the polar factor: Higham, Functions of Matrices, 2008, section 8.3; an error e becomes 3/4 e^2.
-    """
+    """The pose (4, 4) with the rotation that is nearest to its own: products of poses multiply what is missing."""
+    left, _, right = np.linalg.svd(pose[:3, :3])
     pose = pose.copy()
-    for _ in range(2):
-        turn = pose[:3, :3].copy()
-        pose[:3, :3] = 1.5 * turn - 0.5 * turn @ turn.T @ turn
+    pose[:3, :3] = left @ right
     return pose
 
 

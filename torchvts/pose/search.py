@@ -26,15 +26,6 @@ class _Square(NamedTuple):
     center_mm: tuple[float, float]
 
 
-class _Peak(NamedTuple):
-    """One local maximum of the correlation: its score, rotation (index) and shift (row, column, modulo the transform's size)."""
-
-    score: float
-    turn: int
-    row: int
-    column: int
-
-
 def search_plane(source: Grid, target: Grid, most: int = 48, angle: Tensor | None = None) -> tuple[Tensor, Tensor]:
     """Find the in-plane rotations and shifts under which the slopes of two grids agree best.
 
@@ -56,19 +47,17 @@ def search_plane(source: Grid, target: Grid, most: int = 48, angle: Tensor | Non
     angle = torch.deg2rad(torch.arange(0.0, 360.0, STEP_DEG, dtype=torch.float32)) if angle is None else angle
     moving, fixed = _square(source, rotatable=True), _square(target)
     score = _masked_correlation(moving.channels, fixed.channels, angle)
-    peaks = _peaks(score, max(1, min(round(PEAK_MM / target.pitch), min(score.shape[1:]) // 2)), around, most)
-    poses = torch.eye(4, dtype=torch.float64).repeat(len(peaks), 1, 1)
-    for pose, peak in zip(poses, peaks):
-        side, size = fixed.channels.shape[1], score.shape[1]
-        down, right = (shift if shift < side else shift - size for shift in (peak.row, peak.column))
-        offset = 0.5 * (moving.channels.shape[1] - side)
-        c, s = math.cos(float(angle[peak.turn])), math.sin(float(angle[peak.turn]))
-        x = fixed.center_mm[0] + (right + offset) * target.pitch
-        y = fixed.center_mm[1] - (down + offset) * target.pitch
-        pose[0, 0], pose[0, 1], pose[1, 0], pose[1, 1] = c, -s, s, c
-        pose[0, 3] = x - (c * moving.center_mm[0] - s * moving.center_mm[1])
-        pose[1, 3] = y - (s * moving.center_mm[0] + c * moving.center_mm[1])
-    return poses, torch.tensor([peak.score for peak in peaks])
+    reach = max(1, min(round(PEAK_MM / target.pitch), min(score.shape[1:]) // 2))
+    best, turn, shift = _peaks(score, reach, around, most)
+    side, size = fixed.channels.shape[1], score.shape[1]
+    down, right = torch.where(shift < side, shift, shift - size).double() + 0.5 * (moving.channels.shape[1] - side)
+    c, s = angle[turn].double().cos(), angle[turn].double().sin()
+    poses = torch.eye(4, dtype=torch.float64).repeat(len(best), 1, 1)
+    poses[:, 0, 0], poses[:, 0, 1], poses[:, 1, 0], poses[:, 1, 1] = c, -s, s, c
+    (x, y), (to_x, to_y) = moving.center_mm, fixed.center_mm
+    poses[:, 0, 3] = to_x + right * target.pitch - (c * x - s * y)
+    poses[:, 1, 3] = to_y - down * target.pitch - (s * x + c * y)
+    return poses, best
 
 
 def _masked_correlation(moving: Tensor, fixed: Tensor, angle: Tensor) -> Tensor:
@@ -95,15 +84,19 @@ def _masked_correlation(moving: Tensor, fixed: Tensor, angle: Tensor) -> Tensor:
     return score
 
 
-def _peaks(score: Tensor, reach: int, around: bool, most: int) -> list[_Peak]:
-    """The best shifts that no shift within ``reach`` beats, nor a neighbouring rotation if they go ``around``, best first."""
+def _peaks(score: Tensor, reach: int, around: bool, most: int) -> tuple[Tensor, Tensor, Tensor]:
+    """The best shifts that no shift within ``reach`` beats, nor a neighbouring rotation if they go ``around``, best first.
+
+    Returns:
+        Scores (K,), the rotation of each (K,), and its rows and columns (2, K), modulo the size of the transform.
+    """
     highest = _largest_around(_largest_around(score, 1, reach), 2, reach)
     if around:
         highest = _largest_around(highest, 0, 1)
     rows, columns = score.shape[1:]
     best, index = torch.where(score >= highest, score, 0.0).flatten().topk(min(most, score.numel()))
-    places = torch.stack((index // (rows * columns), index // columns % rows, index % columns), 1).tolist()
-    return [_Peak(value, *place) for value, place in zip(best.tolist(), places, strict=True) if value > 0.0]
+    index = index[best > 0.0]
+    return best[best > 0.0], index // (rows * columns), torch.stack((index // columns % rows, index % columns))
 
 
 def _largest_around(values: Tensor, dim: int, reach: int) -> Tensor:

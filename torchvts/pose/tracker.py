@@ -5,20 +5,20 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from numpy.linalg import inv
 from torch import Tensor
 
 from ..core.checks import check_positive
 from ..core.geometry import check_rigid
 from ..skin import DotMotion
 from .ambiguity import UNKNOWN_VARIANCE
-from .direct import equal_poses, likely_poses, message_of, symmetries
+from .direct import equal_poses, likely_poses, symmetries
 from .dots import carried, fused, points_under
 from .follow import TRUSTED_DEG, TRUSTED_MM, Followed, follow, in_common
 from .grids import LEAST_CELLS, DepthFrame, Grids, Surface, Unusable, grids, pitch_by_slopes, surface_of
-from .inverse import LEAST_FITNESS, LEAST_OVERLAP, MOST_COST
 from .keyframe import KeyframeGraph, make_keyframe
 from .result import Registration
-from .rigid import Array, cross, distance_mm, inverted, moved_covariance, orthonormal
+from .rigid import Array, cross, distance_mm, moved_covariance, orthonormal
 from .uncertainty import LEAST_SLOPE_NOISE
 
 ENOUGH = 0.5
@@ -173,7 +173,7 @@ class PoseTracker:
     def _track(self, contact: Surface, frame: Grids) -> TrackedPose:
         """Follow the object from its last pose."""
         last = self._poses[-1]
-        starts = [last] if len(self._poses) < 2 else [last, last @ inverted(self._poses[0]) @ last]
+        starts = [last] if len(self._poses) < 2 else [last, last @ inv(self._poses[0]) @ last]
         older = self._older_keyframe(frame, starts[-1])
         found = self._follow(self._active if older is None else older, frame, starts)
         if older is not None and not self._problem(older, found, starts):
@@ -189,7 +189,7 @@ class PoseTracker:
 
     def _follow(self, index: int, frame: Grids, starts: list[Array]) -> Followed:
         """Register to a keyframe; what is unknown follows the dots, unless they contradict what is known: then the object slips."""
-        to_reference, keyframe = inverted(self.graph.poses[index]), self.graph.keyframes[index]
+        to_reference, keyframe = inv(self.graph.poses[index]), self.graph.keyframes[index]
         poses = [start @ to_reference for start in starts]
         if self._carried is not None:
             expected = self._carried @ to_reference
@@ -214,12 +214,12 @@ class PoseTracker:
 
     def _in_common(self, index: int, frame: Grids, pose: Array) -> tuple[float, float]:
         """:func:`in_common` of a keyframe and a frame, by the pose of the reference in the frame."""
-        return in_common(self.graph.keyframes[index], frame, pose @ inverted(self.graph.poses[index]))
+        return in_common(self.graph.keyframes[index], frame, pose @ inv(self.graph.poses[index]))
 
     def _close_loop(self, older: int, found: Followed, also: Followed, starts: list[Array]) -> None:
         """Link the present keyframe with an older one by a frame that is registered to both, and go on with the older one."""
         if not self._problem(self._active, also, starts):
-            back = inverted(also.pose)
+            back = inv(also.pose)
             covariance = moved_covariance(back, found.covariance + also.covariance)
             twist = self.graph.close(self._active, older, back @ found.pose, covariance)
             middle = twist[3:] + np.cross(twist[:3], self.graph.keyframes[self._active].many.center)
@@ -228,18 +228,9 @@ class PoseTracker:
 
     def _problem(self, index: int, found: Followed, starts: list[Array]) -> str:
         """Why a pose cannot be trusted; empty if it can."""
-        fitness, overlap, cost = found.score
-        if not found.score.is_enough():
-            common = f"{100 * overlap:.0f} % of the smaller contact in common"
-            if fitness >= LEAST_FITNESS and overlap < LEAST_OVERLAP:
-                return f"too little to compare near the last pose, {common}: lifted, another part of the object, or a jump"
-            agrees = f"{100 * fitness:.0f} % of what is compared agrees, {common}"
-            if cost > MOST_COST:
-                agrees += f", mean truncated residual {cost:.2f}, {MOST_COST:g} at most"
-            return f"nothing fits near the last pose: {agrees}: another part of the object, a jump, or another object"
-        if found.free.shape[1] == 6:
-            return "the contact is too small: no motion of it is known"
-        spread, to_reference = self.graph.keyframes[index].spread, inverted(self.graph.poses[index])
+        if found.misfit:
+            return f"near the last pose {found.misfit}"
+        spread, to_reference = self.graph.keyframes[index].spread, inv(self.graph.poses[index])
         moved = min(distance_mm(spread, found.pose, start @ to_reference) for start in starts)
         if moved > JUMP_MM:
             return f"a jump of {moved:.1f} mm at the contact: another pose may look alike"
@@ -250,7 +241,7 @@ class PoseTracker:
         message = "" if len(frame.coarse.pixels()[0]) >= LEAST_CELLS else "hardly any contact"
         for index in dict.fromkeys(() if message else (0, self._active)):
             keyframe, chain = self.graph.keyframes[index], self.graph.poses[index]
-            back, spread = inverted(chain), self.graph.keyframes[0].spread
+            back, spread = inv(chain), self.graph.keyframes[0].spread
             starts = likely_poses(keyframe, frame)
             starts.insert(1, self._poses[-1] @ back)
             motions = [chain @ motion @ back for motion in self._reference_symmetries()]
@@ -258,7 +249,7 @@ class PoseTracker:
             problems = [self._problem(index, one, [one.pose @ chain]) for one in equal]
             equal = [one for one, problem in zip(equal, problems, strict=True) if not problem]
             if not equal:
-                message = message or next(iter(problems), message_of(follow(keyframe, frame, starts[:1]).score, False))
+                message = message or next(iter(problems), follow(keyframe, frame, starts[:1]).misfit)
                 continue
             found = min(equal, key=lambda one: distance_mm(spread, one.pose @ chain, self._poses[-1]))
             vaguest = max(equal, key=lambda one: one.free.shape[1])
@@ -268,7 +259,7 @@ class PoseTracker:
             if not found.exact and frame.touching < ENOUGH * keyframe.grids.touching:
                 message = "it touches with a small part, which other parts of the object may look like"
                 continue
-            self._symmetries = [inverted(found.pose @ chain) @ one.pose @ chain for one in equal if one is not found]
+            self._symmetries = [inv(found.pose @ chain) @ one.pose @ chain for one in equal if one is not found]
             self._poses = self._on_the_way(found.pose @ chain)
             self._active, self._least, self._tracking = index, math.inf, True
             return self._accept(contact, frame, found)
@@ -278,7 +269,7 @@ class PoseTracker:
         """The pose before one that a search found, if that lies on an even motion over a single frame that was lost."""
         if self._missed is None:
             return []
-        expected = self._missed @ inverted(self._poses[-1]) @ self._missed
+        expected = self._missed @ inv(self._poses[-1]) @ self._missed
         return [self._missed] if distance_mm(self.graph.keyframes[0].spread, expected, pose) < JUMP_MM else []
 
     def _reference_symmetries(self) -> list[Array]:
@@ -304,14 +295,13 @@ class PoseTracker:
         if (grown or moved_on or vague) and found.free.shape[1] <= keyframe.held.shape[1]:  # else what is unknown now would stay so
             self._take_keyframe(contact, found, variance)
         std_deg, std_mm = math.hypot(found.std_deg, drift_deg), math.hypot(found.std_mm, drift_mm)
-        exact = found.exact and 3.0 * std_deg <= TRUSTED_DEG and 3.0 * std_mm <= TRUSTED_MM
+        exact = found.settled and 3.0 * std_deg <= TRUSTED_DEG and 3.0 * std_mm <= TRUSTED_MM
         message = f"{100 * found.score.fitness:.0f} % of the common contact agrees"
         if found.names:
             by = "kept" if self._by_dots is None else "by the dots"
             message += f"; {by}, because the surface slides on itself: {', '.join(found.names)}"
         if not exact:
-            by_drift = found.exact or (drift_deg > found.std_deg and 3.0 * drift_deg > TRUSTED_DEG)
-            reason = "the way over keyframes adds up" if by_drift else "parts of the contact disagree"
+            reason = "the way over keyframes adds up" if drift_deg > found.std_deg else "parts of the contact disagree"
             reason = reason if found.settled else "the last step was a large one"
             degrees = f"{std_deg:.1f}" if std_deg < 90.0 else "more than 90"
             message += f"; uncertain by {degrees} degrees and {std_mm:.2f} mm: {reason}"
@@ -332,10 +322,7 @@ class PoseTracker:
 
     def _drift(self, found: Followed) -> tuple[Array, float, float]:
         """What the way over keyframes adds: a covariance (6, 6), and standard deviations in degrees and mm."""
-        covariance = self.graph.covariances[self._active]
-        if not covariance.any():
-            return covariance, 0.0, 0.0
-        drift = moved_covariance(found.pose, covariance)
+        drift = moved_covariance(found.pose, self.graph.covariances[self._active])
         center = found.pose[:3, :3] @ self.graph.keyframes[self._active].many.center + found.pose[:3, 3]
         to_center = np.hstack((-cross(center), np.eye(3)))
         degrees = math.degrees(math.sqrt(float(np.trace(drift[:3, :3]))))

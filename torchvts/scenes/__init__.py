@@ -4,7 +4,7 @@ from . import objects
 from .camera import render, skin_spots
 from .dots import DottedSkin, Drag
 from .letters import distance_to_segments, letter_segments
-from .presses import cone_press, cylinder_press, letters_press, punch_press, sine_press, sphere_press
+from .presses import cone_depth, cylinder_depth, letters_depth, punch_depth, sine_depth, sphere_press
 from .skin import hanging_skin
 from .surfaces import Scene, smooth_step, surface, surface_at, undeformed
 
@@ -12,16 +12,16 @@ __all__ = [
     "DottedSkin",
     "Drag",
     "Scene",
-    "cone_press",
-    "cylinder_press",
+    "cone_depth",
+    "cylinder_depth",
     "distance_to_segments",
     "hanging_skin",
     "letter_segments",
-    "letters_press",
+    "letters_depth",
     "objects",
-    "punch_press",
+    "punch_depth",
     "render",
-    "sine_press",
+    "sine_depth",
     "skin_spots",
     "smooth_step",
     "sphere_press",

@@ -50,7 +50,7 @@ def render(
     Raises:
         ValueError: ``shadows`` with a pinhole camera.
     """
-    check_record("scene", scene, Scene, "sphere_press and the other presses make one")
+    check_record("scene", scene, Scene, "surface or sphere_press makes one")
     noise_std, gamma = check_least("noise_std", noise_std), check_positive("gamma", gamma)
     vignetting, seed = check_least("vignetting", vignetting, 0.0, 1.0), check_seed("seed", seed)
     if bits is not None and check_integer("bits", bits, 1) > 16:

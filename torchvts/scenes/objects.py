@@ -13,16 +13,14 @@ from torch import Tensor
 
 from ..core.checks import (
     check_dtype,
-    check_float_tensor,
     check_integer,
     check_least,
     check_numbers,
     check_positive,
     check_seed,
-    check_shape,
     check_size,
 )
-from ..core.geometry import normal_from_gradient, pixel_grid_mm
+from ..core.geometry import check_rigid, normal_from_gradient, pixel_grid_mm
 from .letters import Segment, distance_to_segments, letter_segments
 from .surfaces import Scene, check_function, smooth_step, with_slope
 
@@ -116,14 +114,7 @@ def press(
     fillet_mm = check_positive("fillet_mm", fillet_mm)
     check_dtype("dtype", dtype)
     check_function("height_mm", height_mm)
-    check_float_tensor("T_sensor_object", T_sensor_object)
-    check_shape("T_sensor_object", T_sensor_object, (4, 4))
-    transform = T_sensor_object.detach().double()
-    turned = transform[:3, :3]
-    if not bool((turned @ turned.T - torch.eye(3, dtype=torch.float64)).abs().max() < 1e-3):
-        raise ValueError(
-            "T_sensor_object: expected a rigid motion, got one that stretches or is not finite: objects.pose makes one"
-        )
+    transform = check_rigid("T_sensor_object", T_sensor_object)
     rotation, shift = transform[:3, :3], transform[:3, 3]
     if float(rotation[2, 2]) < 0.9:
         raise ValueError(f"T_sensor_object: expected a tilt below 25 degrees, got cos {float(rotation[2, 2]):.3f}")

@@ -1,4 +1,4 @@
-"""Objects pressed straight into the skin: ball, capsule, cone, texture, punch and letters, as exact scenes of :func:`surface`."""
+"""Objects pressed straight into the skin: ball, capsule, cone, texture, punch and letters, as depths for :func:`surface`."""
 
 import math
 
@@ -7,7 +7,7 @@ from torch import Tensor
 
 from ..core.checks import check_least, check_numbers, check_positive
 from .letters import distance_to_segments, letter_segments
-from .surfaces import Scene, smooth_step, surface
+from .surfaces import Depth, Scene, smooth_step, surface
 
 
 def sphere_press(
@@ -40,17 +40,13 @@ def sphere_press(
     return surface(depth, height, width, mm_per_pixel, dtype, camera_height_mm)
 
 
-def cylinder_press(
+def cylinder_depth(
     radius_mm: float = 4.0,
     press_mm: float = 0.5,
     length_mm: float = 16.0,
     angle_deg: float = 25.0,
     center_mm: tuple[float, float] = (0.0, 0.0),
-    height: int = 480,
-    width: int = 640,
-    mm_per_pixel: float = 0.0625,
-    dtype: torch.dtype = torch.float32,
-) -> Scene:
+) -> Depth:
     """A lying cylinder with round ends (a capsule).
 
     Args:
@@ -59,7 +55,6 @@ def cylinder_press(
         length_mm: length of the straight part, mm.
         angle_deg: direction of its axis, from x towards y (down), degrees.
         center_mm: (x, y) of its middle in image axes, mm.
-        height, width, mm_per_pixel, dtype: as for :func:`surface`.
     """
     check_positive("press_mm", press_mm, check_positive("radius_mm", radius_mm))
     check_numbers("center_mm", center_mm, (2,))
@@ -70,19 +65,15 @@ def cylinder_press(
         beyond = (along.abs() - 0.5 * length_mm).clamp_min(0.0)
         return _cap(across**2 + beyond**2, radius_mm, press_mm)
 
-    return surface(depth, height, width, mm_per_pixel, dtype)
+    return depth
 
 
-def cone_press(
+def cone_depth(
     half_angle_deg: float = 65.0,
     press_mm: float = 1.0,
     tip_radius_mm: float = 0.5,
     center_mm: tuple[float, float] = (0.0, 0.0),
-    height: int = 480,
-    width: int = 640,
-    mm_per_pixel: float = 0.0625,
-    dtype: torch.dtype = torch.float32,
-) -> Scene:
+) -> Depth:
     """A cone with a rounded tip.
 
     Args:
@@ -90,7 +81,6 @@ def cone_press(
         press_mm: how far the tip is pressed in, mm.
         tip_radius_mm: radius of the tip, mm.
         center_mm: (x, y) of the axis in image axes, mm.
-        height, width, mm_per_pixel, dtype: as for :func:`surface`.
     """
     half_angle_deg = check_positive("half_angle_deg", half_angle_deg, 89.9)
     check_positive("press_mm", press_mm), check_positive("tip_radius_mm", tip_radius_mm)
@@ -104,25 +94,16 @@ def cone_press(
         tip = _cap(torch.minimum(r, touch) ** 2, tip_radius_mm, press_mm)
         return torch.where(r < touch, tip, press_mm - drop - (r - touch) * wall)
 
-    return surface(depth, height, width, mm_per_pixel, dtype)
+    return depth
 
 
-def sine_press(
-    amplitude_mm: float = 0.1,
-    period_mm: float = 2.0,
-    radius_mm: float = 8.0,
-    height: int = 480,
-    width: int = 640,
-    mm_per_pixel: float = 0.0625,
-    dtype: torch.dtype = torch.float32,
-) -> Scene:
+def sine_depth(amplitude_mm: float = 0.1, period_mm: float = 2.0, radius_mm: float = 8.0) -> Depth:
     """A smooth round pad with a sine texture in both directions; depth and slope are both zero at its rim.
 
     Args:
         amplitude_mm: amplitude of the texture, mm.
         period_mm: period of the texture in x and in y, mm.
         radius_mm: radius of the pad, mm.
-        height, width, mm_per_pixel, dtype: as for :func:`surface`.
     """
     check_positive("amplitude_mm", amplitude_mm), check_positive("period_mm", period_mm), check_positive("radius_mm", radius_mm)
     wave = 2.0 * torch.pi / period_mm
@@ -131,19 +112,10 @@ def sine_press(
         window = (1.0 - (x**2 + y**2) / radius_mm**2).clamp_min(0.0) ** 2
         return amplitude_mm * window * (2.5 + torch.sin(wave * x) * torch.sin(wave * y))
 
-    return surface(depth, height, width, mm_per_pixel, dtype)
+    return depth
 
 
-def punch_press(
-    radius_mm: float = 5.0,
-    press_mm: float = 0.6,
-    tilt_deg: float = 2.0,
-    wall_mm: float = 1.0,
-    height: int = 480,
-    width: int = 640,
-    mm_per_pixel: float = 0.0625,
-    dtype: torch.dtype = torch.float32,
-) -> Scene:
+def punch_depth(radius_mm: float = 5.0, press_mm: float = 0.6, tilt_deg: float = 2.0, wall_mm: float = 1.0) -> Depth:
     """A flat round punch, tilted about y, with a smooth flank.
 
     Args:
@@ -151,7 +123,6 @@ def punch_press(
         press_mm: depth in the middle, mm.
         tilt_deg: tilt about y, degrees.
         wall_mm: width of the flank, mm.
-        height, width, mm_per_pixel, dtype: as for :func:`surface`.
     """
     check_positive("radius_mm", radius_mm), check_positive("press_mm", press_mm), check_positive("wall_mm", wall_mm)
     check_least("tilt_deg", tilt_deg, -math.inf)
@@ -161,20 +132,16 @@ def punch_press(
         outside = (torch.sqrt(x**2 + y**2 + 1e-18) - radius_mm) / wall_mm
         return (press_mm + slope * x).clamp_min(0.0) * (1.0 - smooth_step(outside))
 
-    return surface(depth, height, width, mm_per_pixel, dtype)
+    return depth
 
 
-def letters_press(
+def letters_depth(
     text: str = "VTS",
     press_mm: float = 0.5,
     size_mm: float = 6.0,
     stroke_mm: float = 1.0,
     bevel_mm: float = 0.6,
-    height: int = 480,
-    width: int = 640,
-    mm_per_pixel: float = 0.0625,
-    dtype: torch.dtype = torch.float32,
-) -> Scene:
+) -> Depth:
     """A stamp with raised letters: strokes of constant width with smooth flanks.
 
     Args:
@@ -183,7 +150,6 @@ def letters_press(
         size_mm: height of a letter in the image, mm.
         stroke_mm: width of the flat top of a stroke, mm.
         bevel_mm: width of the flank, mm.
-        height, width, mm_per_pixel, dtype: as for :func:`surface`.
     Raises:
         ValueError: a character that is not a capital letter, or an empty text.
     """
@@ -194,7 +160,7 @@ def letters_press(
     def depth(x: Tensor, y: Tensor) -> Tensor:
         return press_mm * (1.0 - smooth_step((distance_to_segments(x, y, segments) - 0.5 * stroke_mm) / bevel_mm))
 
-    return surface(depth, height, width, mm_per_pixel, dtype)
+    return depth
 
 
 def _cap(squared: Tensor, radius_mm: float, press_mm: float) -> Tensor:

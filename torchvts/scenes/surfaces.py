@@ -11,6 +11,9 @@ from ..core.checks import check_camera_height, check_dtype, check_float_tensor, 
 from ..core.geometry import normal_from_gradient, pixel_grid_mm
 from ..model.lights import seen_at
 
+Depth = Callable[[Tensor, Tensor], Tensor]
+"""Depth of a surface, mm, as a function of x (right) and y (down), mm; negative where it does not touch the skin."""
+
 
 class Scene(NamedTuple):
     """The exact geometry of one press.
@@ -34,7 +37,7 @@ class Scene(NamedTuple):
 
 
 def surface(
-    depth_mm: Callable[[Tensor, Tensor], Tensor],
+    depth_mm: Depth,
     height: int = 480,
     width: int = 640,
     mm_per_pixel: float = 0.0625,
@@ -72,9 +75,7 @@ def surface(
         return surface_at(depth_mm, x, y, mm_per_pixel, dtype)._replace(camera_height_mm=camera_height_mm)
 
 
-def surface_at(
-    depth_mm: Callable[[Tensor, Tensor], Tensor], x: Tensor, y: Tensor, mm_per_pixel: float, dtype: torch.dtype = torch.float32
-) -> Scene:
+def surface_at(depth_mm: Depth, x: Tensor, y: Tensor, mm_per_pixel: float, dtype: torch.dtype = torch.float32) -> Scene:
     """Make a scene whose pixels see the surface at given positions, which need not form an even grid.
 
     Args:
@@ -116,9 +117,7 @@ def with_slope(name: str, function: Callable[[Tensor, Tensor], Tensor], one: Ten
     return value.detach(), torch.stack(slope)
 
 
-def _seen_by_pinhole(
-    depth_mm: Callable[[Tensor, Tensor], Tensor], u: Tensor, v: Tensor, camera_height_mm: float, steps: int = 100
-) -> tuple[Tensor, Tensor]:
+def _seen_by_pinhole(depth_mm: Depth, u: Tensor, v: Tensor, camera_height_mm: float, steps: int = 100) -> tuple[Tensor, Tensor]:
     """x and y of the surface points behind the pixels that see (u, v) on the undeformed skin."""
     depth = torch.zeros_like(u)
     for _ in range(steps):
@@ -136,7 +135,7 @@ def _seen_by_pinhole(
 
 def undeformed(scene: Scene) -> Scene:
     """The same sensor without contact: depth and gradient are zero."""
-    check_record("scene", scene, Scene, "sphere_press and the other presses make one")
+    check_record("scene", scene, Scene, "surface or sphere_press makes one")
     flat = torch.zeros_like(scene.normal)
     flat[:, 2] = 1.0
     depth_mm, gradient, contact = (torch.zeros_like(part) for part in (scene.depth_mm, scene.gradient, scene.contact))

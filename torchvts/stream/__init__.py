@@ -14,7 +14,6 @@ from .devices import find_camera
 from .files import StreamReport
 from .keys import Keys
 from .live import TactileFrame, TactileStream
-from .numbered import NewestFrame
 from .overlay import Overlay, Sheet
 from .record import Recorder
 from .recording import Recording, check_device
@@ -30,7 +29,6 @@ __all__ = [
     "FrameCheck",
     "Keys",
     "LiveView",
-    "NewestFrame",
     "Overlay",
     "Reader",
     "Recorder",

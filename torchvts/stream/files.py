@@ -9,7 +9,6 @@ from typing import Any
 
 from ..core.checks import check_record, check_switch
 from ..core.files import write_atomically
-from ..pipeline import light_levels
 from ..skin import DotMotion, SkinMotion
 from .live import TactileFrame, TactileStream
 
@@ -62,7 +61,7 @@ class StreamReport:
         deepest = float(frame.output.depth_mm.max())
         conditions, doubt = self.stream.conditions, self.stream.doubt
         assert conditions is not None
-        light, unseen = light_levels(conditions)[0].tolist(), float(conditions.unseen_deg)
+        light, unseen = conditions.light[0, :, 0].tolist(), float(conditions.unseen_deg)
         self.rows.append((frame.number, frame.time_s, area, deepest, light, unseen, doubt))
         if self._follow is not None:
             with self.stream.stages.stage("motion"):

@@ -24,7 +24,7 @@ from .cameras import AS_IT_IS, CameraSettings
 from .numbered import SourceFrames
 from .record import Recorder
 from .recording import NotAtRest, Recording
-from .sources import Reader, Unreadable, check_reader, open_source
+from .sources import LiveReader, Reader, Unreadable, check_reader, open_source
 from .stages import StageClock
 
 UNKNOWN_LIGHT = (
@@ -77,6 +77,7 @@ class TactileStream:
         calibration: of the unit.
         left_out: (number, reason) of the frames that could not be used.
         recording: :class:`Recording`, that of the calibration and its background.
+        recorder: :class:`Recorder` of the raw frames; None without ``record``.
         stages: :class:`StageClock`.
     Raises:
         ValueError: contact or changing light in the first frames, or a source that cannot be read.
@@ -114,11 +115,15 @@ class TactileStream:
         self._zero: list[Tensor] = []
         self._doubted = False
         self._zero_missing = 0
-        self._frames = SourceFrames(_reader_of(source, reconnect_s, record, settings), background_frames, realtime, self.stages)
-        self._size = self._frames.readable[0].shape[:2]
+        self.recorder: Recorder | None = None
+        self._frames = SourceFrames(_reader_of(source, reconnect_s, settings), realtime, self.stages)
         self._begin = partial(Recording, mode=mode, network=network, device=device, contact=contact, stage=self.stages.stage)
         try:
-            first = torch.cat([self._rectified(pixels) for pixels in self._frames.readable])
+            if record is not None:
+                self._record(record)
+            readable = self._frames.read_first(background_frames)
+            self._size = readable[0].shape[:2]
+            first = torch.cat([self._rectified(pixels) for pixels in readable])
             self.calibration = _calibrated(first, sensor_or_calibration, presses)
             self.recording = self._begin(self.calibration, first=first if background_frames > 0 else None)
         except BaseException as error:
@@ -126,6 +131,13 @@ class TactileStream:
             if isinstance(error, NotAtRest) and isinstance(sensor_or_calibration, Sensor):  # what these frames made fits none
                 raise ValueError(UNKNOWN_LIGHT.format(self._sensor.name, int(background_frames))) from error
             raise
+
+    def _record(self, path: str | Path) -> None:
+        """Record the camera from now on."""
+        if not isinstance(self.reader, LiveReader):
+            raise ValueError(f"record: expected a camera, got {self.reader.name}: it is a recording already")
+        self.recorder = Recorder(path, self.fps)
+        self.reader.keep = self.recorder.add
 
     def _rectified(self, pixels: Pixels) -> Tensor:
         frame = rgb_from_bgr(pixels)[None]
@@ -201,8 +213,10 @@ class TactileStream:
         self.close()
 
     def close(self) -> None:
-        """Stop reading and release the source."""
+        """Stop reading, release the source, and finish what is recorded."""
         self._frames.close()
+        if self.recorder is not None:
+            self.recorder.close()
 
     def __iter__(self) -> Iterator[TactileFrame]:
         for index, time_s, pixels in self._frames:
@@ -256,24 +270,12 @@ def _calibrated(first: Tensor, unit: Sensor | Calibration, presses: Sequence[Pre
         return calibrate(background, unit, presses)
 
 
-def _reader_of(
-    source: str | int | Path | Reader, reconnect_s: float, record: str | Path | None, settings: CameraSettings
-) -> Reader:
-    """Open a source, or take a reader of the user's own; record what it gives."""
+def _reader_of(source: str | int | Path | Reader, reconnect_s: float, settings: CameraSettings) -> Reader:
+    """Open a source, or take a reader of the user's own."""
     if isinstance(source, str | int | Path):
-        reader = open_source(source, reconnect_s, settings)
-    elif check_least("reconnect_s", reconnect_s) > 0:
+        return open_source(source, reconnect_s, settings)
+    if check_least("reconnect_s", reconnect_s) > 0:
         raise ValueError(f"reconnect_s: expected 0 with a reader of your own, got {reconnect_s:g}: it must reconnect by itself")
-    elif settings.given:
+    if settings.given:
         raise ValueError(f"settings: expected none with a reader of your own, got {settings}: it must ask the driver by itself")
-    else:
-        reader = check_reader(source)
-    if record is None:
-        return reader
-    try:
-        if not reader.live:
-            raise ValueError(f"record: expected a camera, got {reader.name}: it is a recording already")
-        return Recorder(reader, record)
-    except BaseException:
-        reader.close()
-        raise
+    return check_reader(source)

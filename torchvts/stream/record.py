@@ -11,7 +11,7 @@ import numpy as np
 from ..core.checks import check_path
 from ..core.files import VIDEO_SUFFIXES, Pixels, make_folder, write_atomically, write_pixels
 from ..core.recordings import image_files
-from .sources import SETTLING, Reader, Unreadable, times_file
+from .sources import Unreadable, times_file
 from .video import InTurn, VideoFile
 
 LOSSLESS = ".mkv"
@@ -19,47 +19,41 @@ LOSSLESS = ".mkv"
 
 
 class Recorder:
-    """A live source whose frames are also written as they come; :func:`open_source` reads them again bit for bit, with their times.
+    """Writes the frames of a live source as they come; :func:`open_source` reads them again bit for bit, with their times.
 
-    Frames that come while earlier ones are being written are lost to both; times tell. The first ones, while exposure settles, are
-    not written.
+    Frames that come while earlier ones are being written are lost to the stream too; times tell.
 
     Args:
-        reader: the source.
         path: a new name ending in .mkv for FFV1 (8 bits), or a folder without images for PNG (8 or 16 bits).
+        fps: frames a second that a video states.
     Attributes:
         times: of the frames written, s, from 0; the table has those of the clock too (``unix_s``, seconds since 1970).
     Raises:
         ValueError: a file or a folder with images that is there already, or frames that FFV1 does not hold.
-        OSError: by :meth:`read` or :meth:`close`: not all can be written; what can be read of it is kept.
+        OSError: by :meth:`add` or :meth:`close`: not all can be written; what can be read of it is kept.
     """
 
-    live = True
-
-    def __init__(self, reader: Reader, path: str | Path) -> None:
-        self.name, self.fps, self.path = reader.name, reader.fps, check_path("record", path)
+    def __init__(self, path: str | Path, fps: float) -> None:
+        self.path = check_path("record", path)
         self.times: list[float] = []
-        self._reader, self._lock, self._closed, self._settling = reader, threading.Lock(), False, SETTLING
+        self._lock, self._closed = threading.Lock(), False
         self._start = self._clock = 0.0
         self._video: VideoFile | None = None
         self._images = InTurn()
         if self.path.is_file():
             raise ValueError(f"record: {self.path}: expected a new name, got a file that is there already: name another")
         if self.path.suffix.lower() == LOSSLESS:
-            self._video = VideoFile(self.path, self.fps, keep=True).__enter__()
+            self._video = VideoFile(self.path, fps, keep=True).__enter__()
         elif self.path.suffix.lower() in VIDEO_SUFFIXES:
             raise ValueError(f"record: expected a name ending in {LOSSLESS} or that of a folder, got {self.path.name!r}")
         elif image_files(make_folder(self.path)):
             raise ValueError(f"record: {self.path}: expected a folder without images, got one with some: name another")
 
-    def read(self) -> Pixels | Unreadable | None:
-        pixels, now = self._reader.read(), time.monotonic()
+    def add(self, pixels: Pixels | Unreadable) -> None:
+        """Write a frame that has just come; it waits where too many are being written."""
         with self._lock:
             if isinstance(pixels, np.ndarray) and not self._closed:
-                self._settling -= 1
-                if self._settling < 0:
-                    self._write(pixels, now)
-        return pixels
+                self._write(pixels, time.monotonic())
 
     def _write(self, pixels: Pixels, now: float) -> None:
         if self._video is None:
@@ -75,8 +69,7 @@ class Recorder:
         self.times.append(now - self._start)
 
     def close(self) -> None:
-        """Release the source, and finish the recording."""
-        self._reader.close()
+        """Finish the recording."""
         with self._lock:
             if self._closed:
                 return

@@ -1,14 +1,12 @@
 """Reads frames of cameras, videos and folders of images."""
 
-import queue
-import sys
 import threading
 import time
 import warnings
-from collections.abc import Callable, Iterator, Sequence
-from itertools import chain, pairwise
+from collections.abc import Callable, Iterator
+from itertools import chain, count, pairwise
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 from torch import Tensor
 
@@ -74,126 +72,154 @@ class Reader(Protocol):
         """Release the device or file."""
 
 
-class LiveReader:
-    """A live source that never ends without a word: it is opened again for some time, then an error is raised.
+NumberedFrame = tuple[int, float, Pixels | Unreadable]
+"""Number in the source, time since its start in s, and the frame."""
 
-    The source is read by a thread of its own, because a camera that has hung blocks who reads it.
+
+class Stopped(OSError):
+    """A live source gives no more frames."""
+
+
+class LiveReader:
+    """A source that does not wait, read by a thread of its own, because a camera that has hung blocks who reads it.
+
+    A frame is read when it is asked for; after :meth:`drop_late` all are, and who comes late finds only the newest. What fails,
+    ends or hangs is opened again for some time, then an error is raised. The first frames after opening are left out, while
+    exposure settles. A recording (``live`` of the reader is False) has all its frames, and an end.
 
     Args:
         open_reader: opens the source.
         reconnect_s: for how long to try to open it again after it has stopped; 0 raises at once.
-        sleep: for tests.
     Attributes:
+        keep: is given every frame, in the thread; None for nothing.
         silent_s: a source that gives no frame for this long has stopped.
+        started_s: time 0 of its frames, by :func:`time.monotonic`.
+        dropped: number of frames that nobody took.
         reconnections: how often it was opened again.
     Raises:
-        OSError: by :meth:`read`: the source has stopped.
+        OSError: by :meth:`read` and :meth:`take`: the source has stopped.
     """
 
     live = True
 
-    def __init__(
-        self,
-        open_reader: Callable[[], Reader],
-        reconnect_s: float = 0.0,
-        sleep: Callable[[float], Any] | None = None,
-    ) -> None:
-        self.reconnect_s, self.silent_s = check_least("reconnect_s", reconnect_s), SILENT_S
-        self.reconnections = 0
-        self._closed = threading.Event()
-        self._open, self._sleep = open_reader, sleep or self._closed.wait
+    def __init__(self, open_reader: Callable[[], Reader], reconnect_s: float = 0.0) -> None:
+        self.reconnect_s, self._open = check_least("reconnect_s", reconnect_s), open_reader
+        self.keep: Callable[[Pixels | Unreadable], None] | None = None
+        self.reconnections = self.dropped = self._count = 0
+        self.started_s = time.monotonic()
+        self._changed, self._closed = threading.Condition(), threading.Event()
+        self._asked = self._drops_late = False
         reader = open_reader()
-        self.name, self.fps = reader.name, reader.fps
-        self._worker = _ReadingThread(reader)
+        self.name, self.fps, self.silent_s = reader.name, reader.fps, max(SILENT_S, 2.0 / reader.fps)
+        self._begin(reader)
 
-    def read(self) -> Pixels | Unreadable | None:
-        """The next frame; None only after :meth:`close`.
-
-        Raises:
-            OSError: the source has stopped, and did not come back within ``reconnect_s``.
-        """
-        try:
-            return self._worker.read(self.silent_s)
-        except OSError as error:
-            if self.reconnect_s == 0 and not self._closed.is_set():
-                raise OSError(f"source: {self.name} has stopped: {error}: unplugged? in use elsewhere?") from error
-            reason = error
-        return self._read_again(reason)
-
-    def _read_again(self, reason: OSError) -> Pixels | Unreadable | None:
-        """The first frame after the source was opened again."""
-        last = time.monotonic() + self.reconnect_s
-        while not self._closed.is_set():
-            self._worker.close()
-            try:
-                self._worker = _ReadingThread(self._open())
-                for _ in range(SETTLING):
-                    self._worker.read(self.silent_s)
-                pixels = self._worker.read(self.silent_s)
-                self.reconnections += 1
-                return pixels
-            except (OSError, ValueError) as error:
-                if time.monotonic() > last:
-                    raise OSError(
-                        f"source: {self.name} has stopped ({reason}) and did not come back within {self.reconnect_s:g} s: {error}"
-                    ) from error
-            self._sleep(RETRY_S)
-        return None
-
-    def close(self) -> None:
-        """Release the source; one that hangs is left to its thread, since it cannot be released while it is read."""
-        self._closed.set()
-        self._worker.close()
-
-
-class _ReadingThread:
-    """Reads, and at last closes, a source in a thread of its own."""
-
-    def __init__(self, reader: Reader) -> None:
-        self._reader = reader
-        self._asked: queue.SimpleQueue[bool] = queue.SimpleQueue()
-        self._found: queue.SimpleQueue[Pixels | Unreadable | Exception | None] = queue.SimpleQueue()
-        self._closed = False
-        self._thread = threading.Thread(target=self._run, name="torchvts-camera", daemon=True)
+    def _begin(self, reader: Reader) -> None:
+        self._reader: Reader | None = reader
+        self._newest: NumberedFrame | None = None
+        self._error: Exception | None = None
+        self._thread = threading.Thread(target=self._run, args=(reader,), name="torchvts-reader", daemon=True)
         self._thread.start()
 
-    def _run(self) -> None:
-        while self._asked.get():
-            try:
-                self._found.put(self._reader.read())
-            except Exception as error:  # raised by read()
-                self._found.put(error)
-        self._reader.close()
-
-    def read(self, seconds: float) -> Pixels | Unreadable:
-        """The next frame, within so many seconds.
-
-        Raises:
-            OSError: there is none.
-        """
-        if self._closed or not self._thread.is_alive():
-            raise OSError("it is closed")
-        self._asked.put(True)
+    def _run(self, reader: Reader) -> None:
+        """Read until the source ends, fails, or is no longer the one that is read: a read that hung may return long after."""
+        error: Exception | None = None
         try:
-            found = self._found.get(timeout=seconds)
-        except queue.Empty:
-            self._asked.put(False)
-            raise OSError(f"no frame for {seconds:g} s") from None
-        if found is None:
-            raise OSError("it gives no more frames")
-        if isinstance(found, Exception):
-            raise found
+            for _ in range(SETTLING if reader.live else 0):
+                _read(reader)
+            while self._is_wanted(reader) and (pixels := _read(reader)) is not None:
+                if self.keep is not None and self._reader is reader:
+                    self.keep(pixels)
+                self._put(reader, pixels)
+        except Exception as caught:  # raised by take()
+            error = caught
+        reader.close()
+        with self._changed:
+            if self._reader is reader:
+                self._reader, self._error = None, error
+                self._changed.notify_all()
+
+    def _is_wanted(self, reader: Reader) -> bool:
+        """Wait until a frame is asked for; whether it is one of this reader."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._asked or self._drops_late or self._reader is not reader)
+            return self._reader is reader
+
+    def _put(self, reader: Reader, pixels: Pixels | Unreadable) -> None:
+        with self._changed:
+            if self._reader is reader:
+                self.dropped += self._newest is not None
+                self._newest, self._asked = (self._count, time.monotonic() - self.started_s, pixels), False
+                self._count += 1
+                self._changed.notify_all()
+
+    def drop_late(self) -> None:
+        """Read on by itself from now on, and keep only the newest frame; numbers and times begin anew."""
+        with self._changed:
+            self.started_s, self._count, self._drops_late = time.monotonic(), 0, True
+            self._changed.notify_all()
+
+    def take(self) -> NumberedFrame | None:
+        """The next frame; waits for it; None at the end of a recording, and after :meth:`close`."""
+        found = self._next()
+        if not isinstance(found, Stopped):
+            return found
+        if self.reconnect_s == 0:
+            raise OSError(f"source: {self.name} has stopped: {found}: unplugged? in use elsewhere?") from found
+        reason, last = found, time.monotonic() + self.reconnect_s
+        while isinstance(found, Stopped):
+            if time.monotonic() > last:
+                raise OSError(
+                    f"source: {self.name} has stopped ({reason}) and did not come back within {self.reconnect_s:g} s: {found}"
+                ) from found
+            if self._closed.wait(RETRY_S):
+                return None
+            try:
+                self._begin(self._open())
+                found = self._next()
+            except (OSError, ValueError) as error:
+                found = Stopped(str(error))
+        self.reconnections += 1
         return found
 
+    def _next(self) -> NumberedFrame | Stopped | None:
+        """The next frame, or why the source gives none; raises other errors of its thread."""
+        with self._changed:
+            self._asked = True
+            self._changed.notify_all()
+            self._changed.wait_for(lambda: self._newest or self._reader is None, self.silent_s)
+            newest, self._newest = self._newest, None
+            if newest is None and self._reader is not None:
+                self._reader, self._error = None, Stopped(f"no frame for {self.silent_s:g} s")
+        if newest is not None or self._error is None:
+            return newest
+        if isinstance(self._error, Stopped):
+            return self._error
+        raise self._error
+
+    def read(self) -> Pixels | Unreadable | None:
+        """The pixels of :meth:`take`."""
+        found = self.take()
+        return None if found is None else found[2]
+
     def close(self) -> None:
-        """Close the source, and wait for that unless it hangs; who waits for a frame gets an error."""
-        if self._closed:
-            return
-        self._closed = True
-        self._asked.put(False)
-        self._found.put(OSError("it is closed"))
+        """Release the source; who waits for a frame gets None. One that hangs is left to its thread: it cannot be released."""
+        self._closed.set()
+        with self._changed:
+            self._reader = self._error = self._newest = None
+            self._changed.notify_all()
         if self._thread is not threading.current_thread():
             self._thread.join(timeout=2.0)
+
+
+def _read(reader: Reader) -> Pixels | Unreadable | None:
+    """The next frame of a reader; None at the end of a recording."""
+    try:
+        pixels = reader.read()
+    except OSError as error:
+        raise Stopped(str(error)) from error
+    if pixels is None and reader.live:
+        raise Stopped("it gives no more frames")
+    return pixels
 
 
 def times_file(recording: Path) -> Path:
@@ -220,16 +246,6 @@ def read_times(recording: Path) -> dict[str, float]:
     raise ValueError(f"{path}: expected lines of frame,time_s, times that rise: remove it to read the frames without times")
 
 
-def rate_of(times: Sequence[float], otherwise: float) -> float:
-    """Frames a second of frames at these times, s; the other value where there are not two."""
-    return otherwise if len(times) < 2 else (len(times) - 1) / (times[-1] - times[0])
-
-
-def time_of(index: int, fps: float, times: Sequence[float]) -> float:
-    """Time of a frame of a recording since its start, s: as recorded, else by the rate."""
-    return times[index] if index < len(times) else index / fps
-
-
 class FileReader:
     """A recording: a video, an image, a TIFF of several pages, or a folder of images by name, numbers as numbers."""
 
@@ -246,7 +262,8 @@ class FileReader:
         self._frames: Iterator[RawFrame] = chain((first,), frames)
         names = [file.stem for file in image_files(path)] if path.is_dir() else list(known)
         self.times = [known[name] for name in names] if all(name in known for name in names) else []
-        self.fps = rate_of(self.times, video_rate(path))
+        spans = len(self.times) - 1
+        self.fps = spans / (self.times[-1] - self.times[0]) if spans > 0 else video_rate(path)
         self.fps_assumed = not self.times and path.suffix.lower() not in VIDEO_SUFFIXES
 
     def read(self) -> Pixels | Unreadable | None:
@@ -297,11 +314,10 @@ def frames(source: str | int | Path) -> Iterator[tuple[str, Tensor]]:
 
 def _of_camera(reader: Reader) -> Iterator[tuple[str, Tensor]]:
     try:
-        for number in range(-SETTLING, sys.maxsize):
-            pixels = reader.read()
-            if pixels is None:
+        for number in count():
+            if (pixels := reader.read()) is None:
                 return
-            if number >= 0 and not isinstance(pixels, Unreadable):
+            if not isinstance(pixels, Unreadable):
                 yield f"{number:06d}", rgb_from_bgr(pixels)
     finally:
         reader.close()

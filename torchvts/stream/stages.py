@@ -2,7 +2,7 @@
 
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 
 import numpy as np
@@ -14,19 +14,18 @@ STAGES = ("read", "wait", "rectify", "light", "depth", "draw", "view", "write")
 class StageClock:
     """Measures the milliseconds of each stage, of the last 10,000 frames."""
 
-    def __init__(self, clock: Callable[[], float] = time.perf_counter) -> None:
-        self._clock = clock
+    def __init__(self) -> None:
         self._frames: deque[dict[str, float]] = deque(maxlen=10_000)  # a camera may run for days
         self._now: dict[str, float] = {}
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
         """Measure the time of the block."""
-        start = self._clock()
+        start = time.perf_counter()
         try:
             yield
         finally:
-            self._now[name] = self._now.get(name, 0.0) + 1000.0 * (self._clock() - start)
+            self._now[name] = self._now.get(name, 0.0) + 1000.0 * (time.perf_counter() - start)
 
     def end_frame(self) -> None:
         """Close a frame: what was measured since the last call belongs to it."""

@@ -9,9 +9,9 @@ import torch
 from torch import Tensor, nn
 from tqdm import tqdm
 
-from ..core.checks import check_float_tensor, check_integer, check_least, check_range, check_shape, check_switch
+from ..core.checks import check_field, check_float_tensor, check_integer, check_least, check_range, check_shape, check_switch
 from ..normals import NormalFromMLP
-from ..normals.mlp import MAX_GRADIENT, check_flat_shape
+from ..normals.mlp import MAX_GRADIENT
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +109,7 @@ def fit_mlp(
     check_least("weight_decay", weight_decay), check_least("held_out", held_out, 0.0, 1.0)
     if not 0.0 < held_out < 1.0:
         raise ValueError(f"held_out: expected a share of the presses in (0, 1), got {held_out}")
-    check_flat_shape(flat)
+    check_field("flat", flat)
     module = NormalFromMLP(flat.shape[1], flat.shape[2], flat, hidden, seed=seed, input_domain=input_domain, blur_px=blur_px)
     _check_places(xy, flat)
     generator = torch.Generator().manual_seed(seed)

@@ -1,9 +1,7 @@
 /* Sums of a tracked pose, which a frame passes through: torchvts/pose/inverse.py and height_errors.py, which explain them. */
 #include "kernels.h"
 
-#define SIZE 7  /* six twists and the residual */
-#define SUMS 56 /* SIZE * SIZE products, then seven sums of the score: */
-enum { USED = SIZE * SIZE, WEIGHT, SLOPES, HEIGHTS, BAD, GOOD, COMPARED };
+#define SIZE 7 /* six twists and the residual */
 
 /* What the residuals depend on beside the pixels; the order is that of residual_limits in inverse.py. */
 typedef struct {
@@ -122,7 +120,8 @@ INLINE void add_products(const float *jacobian, int64_t stride, int size, const 
     }
 }
 
-/* Sums over `count` pixels: columns (23, stride) x, y, z, p, q and the 18 of the Jacobian, which score_only does not read. */
+/* Sums over `count` pixels: columns (23, stride) x, y, z, p, q and the 18 of the Jacobian, which score_only does not read.
+   sums: SIZE * SIZE products, then seven of the score. */
 EXPORT WIDE void alignment_sums(
     const float *field, int height, int width, const float *columns, int64_t stride, int count, int score_only, const Limits *at,
     double *sums) {
@@ -157,17 +156,7 @@ EXPORT WIDE void alignment_sums(
     }
     for (int k = 0, pair = 0; k < SIZE; k++)
         for (int m = k; m < SIZE; m++, pair++) sums[SIZE * k + m] = sums[SIZE * m + k] = sum_of(products + pair);
-    for (int k = 0; k < 7; k++) sums[USED + k] = sum_of(score + k);
-}
-
-/* alignment_sums of each of `parts` runs of pixels, of the same number but for one: sums (parts, SUMS). */
-EXPORT void part_sums(
-    const float *field, int height, int width, const float *columns, int64_t stride, int count, int parts, const Limits *at,
-    double *sums) {
-    for (int k = 0; k < parts; k++) {
-        const int first = (int)((int64_t)count * k / parts), end = (int)((int64_t)count * (k + 1) / parts);
-        alignment_sums(field, height, width, columns + first, stride, end - first, 0, at, sums + (int64_t)SUMS * k);
-    }
+    for (int k = 0; k < 7; k++) sums[SIZE * SIZE + k] = sum_of(score + k);
 }
 
 /* Sums of the heights of the frame minus those of the pixels, by cells, and how many they are. */

@@ -70,8 +70,8 @@ EDGE_DEPTH_SHARE = 1.5
 error lie within 1.96 standard deviations."""
 
 ALIKE = 0.5
-"""Share of the variance of a response field's slopes that is alike over all of a contact, as a gain; half of it as a tilt along each
-axis. What is left changes its sign within the contact. Of point lights all of it is alike."""
+"""Share of the variance of a field's slopes that is alike over all of a contact, as a gain; half of it as a tilt along each axis.
+What is left changes its sign within the contact. Of point lights all of it is alike."""
 
 GRID_PX2 = 0.6
 """Variance of the blur of normals by differences of depth, px^2: a box of two pixels, and the mean of two neighbours."""

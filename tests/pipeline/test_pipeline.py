@@ -10,6 +10,7 @@ from torchvts import NormalModel
 from torchvts.compensate import unchanged_light
 from torchvts.integration import PerspectiveIntegration
 from torchvts.pipeline import Shadows
+from torchvts.scenes import objects
 
 scenes = vts.scenes
 PITCH = 0.0625
@@ -600,3 +601,14 @@ def test_vmap_is_refused_with_a_sentence(ring):
     pipe = pipeline(ring(), vts.Sensor("rig", 48, 64, 0.5), "fast")
     with pytest.raises(RuntimeError, match=r"images: expected a batch of frames, got a frame of torch\.func\.vmap: call it on the"):
         torch.func.vmap(lambda image: pipe(image[None]).depth_mm[0])(torch.rand(2, 3, 48, 64))
+
+
+def test_skin_that_hangs_far_around_an_object_counts(ring):
+    """A soft gel: no skin in view is undeformed, and spreads of all of it hid 0.17 of 1 mm."""
+    height, width, pitch, lights = 96, 128, 0.14, ring(14.0, 14.0)
+    reached = objects.press(objects.stamp("XO", 4.6), objects.pose(30.0, (0.5, 0.3), 1.0), height, width, pitch, fillet_mm=1e-4)
+    scene = vts.scenes.hanging_skin(torch.where(reached.contact, reached.depth_mm, -1.0), 2.0, pitch)
+    image, rest = (vts.scenes.render(s, lights, noise_std=0.003, bits=8).detach() for s in (scene, vts.scenes.undeformed(scene)))
+    unit = vts.Calibration.from_lights(lights, vts.Sensor("soft", height, width, pitch), rest[0])
+    depth = vts.DepthPipeline.from_calibration(unit)(image).depth_mm
+    assert -0.12 < float((depth - scene.depth_mm)[scene.contact].mean()) < 0.0

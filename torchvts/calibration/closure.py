@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from .contacts import Contact
-from .field import SMALL_PENALTY, Family
+from .field import Family
 from .posterior import Evidence, Prior
 
 REACH = 1.5
@@ -23,7 +23,7 @@ STEP = 0.7
 CLOSURE_ROUNDS = 3
 
 LEFT = 0.75
-"""Net slope that may be left after the shift, as a part of that before."""
+"""Net slope that may be left after the shift, as a part of that before, in the mean over the two largest families."""
 
 ENOUGH = 3
 """Presses from which centers can be scored by holding presses out."""
@@ -34,12 +34,15 @@ MOST_SATURATED = 0.05
 MOST_CUT = 0.5
 """Share of the presses that may be without a net slope: cut by the image border, or saturated."""
 
+PENALTY = 0.01
+"""Regularisation of the fields, in presses."""
+
 
 def close_loops(contacts: list[Contact], half_mm: float) -> None:
     """Move the centers by what loop closure predicts, as long as slopes in and around the contacts agree better; in place.
 
-    The score is the held-out angle inside the contact and the angle of the net slope over the disc, both as root mean squares over
-    the presses, added in squares. The contact radii stay.
+    Tried are one common shift, and then a shift of each ball. The score is the held-out angle inside the contact and the angle of
+    the net slope over the disc, both as root mean squares over the presses, added in squares. The contact radii stay.
 
     Args:
         contacts: of presses with located balls.
@@ -47,15 +50,20 @@ def close_loops(contacts: list[Contact], half_mm: float) -> None:
     """
     if len(contacts) < ENOUGH or all(contact.known for contact in contacts):
         return
-    before = found = _Rating(Family(2, -1, half_mm), contacts)
+    degrees = ((1, -1), (2, -1), (2, 1)) if len(contacts) >= 5 else ((0, -1), (1, -1))
+    before = [_Rating(Family(degree, products, half_mm), contacts) for degree, products in degrees]
+    found = min(before, key=lambda rating: rating.inside_deg)
     if float(found.errors_mm.isnan().any(1).double().mean()) > MOST_CUT:
         return
-    for _ in range(CLOSURE_ROUNDS):
-        moved = _Rating(found.family, _moved(found.contacts, found.errors_mm))
-        if moved.score() >= found.score():
-            break
-        found = moved
-    if found.around_deg > LEFT * before.around_deg:
+    for common in (True, False):
+        for _ in range(CLOSURE_ROUNDS):
+            moved = _Rating(found.family, _moved(found.contacts, found.errors_mm, common))
+            if moved.score() >= found.score():
+                break
+            found = moved
+    after = [_Rating(rating.family, found.contacts) for rating in before[-2:]]
+    left = [one.around_deg / max(other.around_deg, 1e-9) for one, other in zip(after, before[-2:])]
+    if sum(left) / len(left) > LEFT:
         return
     for contact, moved_contact in zip(contacts, found.contacts):
         contact.center_mm = moved_contact.center_mm
@@ -66,7 +74,7 @@ class _Rating:
 
     def __init__(self, family: Family, contacts: list[Contact]) -> None:
         evidence = Evidence(family, contacts)
-        prior = Prior(torch.zeros(2, family.size(), dtype=torch.float64), SMALL_PENALTY * family.penalty())
+        prior = Prior(torch.zeros(2, family.size(), dtype=torch.float64), PENALTY * family.penalty())
         coefficient = evidence.posterior(prior).mean
         net = torch.stack([_net_slope(item.contact, item.slope(coefficient)) for item in evidence.forms])
         angles = torch.tensor(evidence.held_out_deg(prior), dtype=torch.float64)
@@ -93,10 +101,11 @@ def _net_slope(contact: Contact, slope: Tensor) -> Tensor:
     return slope[:, disc].sum(1) / (r < edge).sum().clamp_min(1)
 
 
-def _moved(contacts: list[Contact], errors_mm: Tensor) -> list[Contact]:
+def _moved(contacts: list[Contact], errors_mm: Tensor, common: bool) -> list[Contact]:
     """Copies with moved centers; where nothing is predicted, with the usual shift of the others."""
+    usual = errors_mm.nanmedian(dim=0).values.expand_as(errors_mm)
     moved = []
-    for contact, error in zip(contacts, torch.where(errors_mm.isnan(), errors_mm.nanmedian(dim=0).values, errors_mm)):
+    for contact, error in zip(contacts, usual if common else torch.where(errors_mm.isnan(), usual, errors_mm)):
         limit = 0.25 * contact.contact_radius_mm
         shift = torch.zeros_like(error) if contact.known else (STEP * error).clamp(-limit, limit)
         moved.append(dataclasses.replace(contact, center_mm=contact.center_mm - shift))

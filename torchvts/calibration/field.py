@@ -38,8 +38,6 @@ DEGREE_PENALTY = 2.0
 """Each degree in position multiplies it: slowly varying fields are likely."""
 CORE = 0.5
 """Share of the contact radius within which slopes are compared with those of a ball of another size."""
-SMALL_PENALTY = 0.01
-"""Prior precision, in presses, of the small fields by which balls without a prior are located and compared with each other."""
 LEAST_POWER = 1e-3
 """Least mean square of the changes, so that a field of nothing stays determined."""
 

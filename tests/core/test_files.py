@@ -280,3 +280,12 @@ def test_values_beyond_the_range_are_cut_and_halves_rounded(tmp_path):
     image[0], image[1] = -0.5, 1.5
     vts.write_image(tmp_path / "image.png", image)
     assert vts.read_image(tmp_path / "image.png")[:, 0, 0].tolist() == pytest.approx([0.0, 1.0, 64 / 255])
+
+
+@pytest.mark.parametrize("length", [16, 20, 25])
+def test_an_image_that_is_cut_in_its_header_is_named(tmp_path, length):
+    vts.write_image(tmp_path / "whole.png", torch.rand(3, 8, 8))
+    for head in ((tmp_path / "whole.png").read_bytes(), b"RIFF\0\0\0\0WEBPVP8X" + bytes(64)):
+        (tmp_path / "cut").write_bytes(head[:length])
+        with pytest.raises(ValueError, match="cut: "):
+            vts.read_image(tmp_path / "cut")

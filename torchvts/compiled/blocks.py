@@ -281,7 +281,7 @@ def mask_values(block: nn.Module, size: tuple[int, int], takes_slopes: bool) -> 
         "square_within": weight_module.SQUARE_WITHIN,
         "fewest": weight_module.FEWEST,
         "moved_depth": weight_module.LEAST_DEPTH,
-    } | _same(block, "by_colour", "sigmas", "least_spread", "most_spread", "rough", "grey_share")
+    } | _same(block, "by_colour", "sigmas", "least_spread", "most_spread", "hanging", "rough", "grey_share")
 
 
 def zero_values(block: nn.Module, size: tuple[int, int]) -> Values:

@@ -215,12 +215,12 @@ def read_pixels(path: str | Path) -> Pixels:
 def check_still_head(head: bytes, path: Path) -> None:
     """Refuse by the first 64 bytes of an encoded image what has a palette or is an animation."""
     remedy = "save frames as PNG in true colour, as a TIFF of several pages or as a video without loss"
-    indexed = {"a GIF": head[:4] == b"GIF8", "a PNG with a palette": head[12:16] == b"IHDR" and head[25] == 3}
+    indexed = {"a GIF": head[:4] == b"GIF8", "a PNG with a palette": head[12:16] == b"IHDR" and head[25:26] == b"\3"}
     indexed["a BMP with a palette"] = head[:2] == b"BM" and 0 < int.from_bytes(head[28:30], "little") <= 8
     for kind, is_it in indexed.items():
         if is_it:
             raise ValueError(f"{path}: expected an image of 8 bits a channel, got {kind}, which keeps 256 colours: {remedy}")
-    if (head[8:16] == b"WEBPVP8X" and head[20] & 2) or b"acTL" in head:
+    if (head[8:16] == b"WEBPVP8X" and int.from_bytes(head[20:21], "big") & 2) or b"acTL" in head:
         raise ValueError(f"{path}: expected one image, got an animation: {remedy}")
 
 

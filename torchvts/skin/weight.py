@@ -25,6 +25,9 @@ LEAST_SLOPE_SPREAD = 0.002
 MOST_SPREAD = 0.012
 """The same at most, beside noise: skin that hangs far around a contact is undeformed nowhere, and its slopes are smooth."""
 
+HANGING = 0.1
+"""Spread beyond which it is no skin that hangs, but another light or unit: the frame then reads as undeformed, and is in doubt."""
+
 ROUGH = 1.57
 """Most spread that is noise, over the median difference of neighbouring cells: one and a half times that of white noise."""
 
@@ -96,7 +99,7 @@ class ContactMask(nn.Module):
         self.sigmas, self.by_colour = check_least("sigmas", sigmas, 1.0, 1000.0), check_switch("by_colour", by_colour)
         self.cells, self.rise, self.grey_share, self.failed = WEIGHT_CELLS, WEIGHT_RISE, GREY_SHARE, FAILED
         self.weights, self.least_spread = gaussian_weights(BLUR_CELLS), LEAST_SLOPE_SPREAD
-        self.most_spread, self.rough = MOST_SPREAD, ROUGH
+        self.most_spread, self.hanging, self.rough = MOST_SPREAD, HANGING, ROUGH
         flat = torch.ones(3, 1, 1) if flat is None else flat
         check_field("flat", flat)
         self.register_buffer("flat", flat.detach().clone())
@@ -171,7 +174,7 @@ class ContactMask(nn.Module):
         spread = spread_of(means.abs().flatten(2) + 1e-6, self.least_spread)  # so that the root has a slope at zero
         steps = (means[..., 1:] - means[..., :-1]).detach().abs().flatten(2).sort(dim=2).values
         most = (self.rough * steps[:, :, steps.shape[2] // 2]).clamp_min(max(self.most_spread, self.least_spread))
-        spread = torch.minimum(spread, most[..., None])[..., None]
+        spread = torch.where(spread < self.hanging, torch.minimum(spread, most[..., None]), spread)[..., None]
         squared = (means.square() / (spread.square() + beside.square())).sum(dim=1, keepdim=True)
         return torch.sqrt(0.5 * squared + 1e-12)
 

@@ -57,7 +57,8 @@ enum { MOST_SIDE = 16384, MOST_PIXELS = 1 << 26, MOST_TAPS = 1025, MOST_WAVES = 
     INTEGER(mask_cell, 1, MOST_SIDE) TABLE(float, mask_flat, 3 * PIXELS) TABLE(float, per_light, 3 * PIXELS)                                  \
     TABLE(float, mask_noise, ROWS(mask_cell) * COLUMNS(mask_cell)) INTEGER(mask_taps, 1, MOST_TAPS) TABLE(float, mask_blur, p->mask_taps)     \
     INTEGER(takes_slopes, 0, 1) INTEGER(by_colour, 0, 1) REAL(rise_from, -1e12) REAL(rise_to, -1e12) REAL(sigmas, 0) REAL(least_spread, 0)    \
-    REAL(most_spread, 0) REAL(rough, 0) REAL(grey_share, 0) REAL(failed_light, 0) REAL(within, 0) REAL(square_within, 0) REAL(fewest, 0)      \
+    REAL(most_spread, 0) REAL(hanging, 0) REAL(rough, 0) REAL(grey_share, 0) REAL(failed_light, 0) REAL(within, 0) REAL(square_within, 0)     \
+    REAL(fewest, 0)                                                                                                                           \
     /* zero.c; cosines along y (waves_y, cells) and x, their pairs of two transposed, at pixels, 1 + L^2 k^2 of each of them */               \
     INTEGER(zero_cell, 1, MOST_SIDE) INTEGER(waves_y, 1, MOST_WAVES) INTEGER(waves_x, 1, MOST_WAVES)                                          \
     TABLE(double, cosine_y, p->waves_y * ROWS(zero_cell)) TABLE(double, cosine_x, p->waves_x * COLUMNS(zero_cell))                            \

@@ -72,7 +72,7 @@ static float most_spread(const Plan *plan, const float *means, int rows, int col
     const int n = rows * (columns - 1);
     for (int y = 0, k = 0; y < rows; y++)
         for (int x = 1; x < columns; x++) some[k++] = fabsf(means[y * columns + x] - means[y * columns + x - 1]);
-    const float noise = (float)plan->rough * sorted(some, some + n, n)[n / 2];
+    const float noise = n > 0 ? (float)plan->rough * sorted(some, some + n, n)[n / 2] : 0.0f;
     return fmaxf(noise, (float)fmax(plan->most_spread, plan->least_spread));
 }
 
@@ -83,7 +83,8 @@ static WIDE float lengths(const Plan *plan, const float *means, int parts, const
     float largest = 0.0f;
     memset(length, 0, sizeof(float) * (size_t)n);
     for (int c = 0; c < parts; c++, means += n) {
-        const float spread = spread_of(plan, means, n, some), taken = fminf(spread, most_spread(plan, means, rows, columns, some)), square = taken * taken;
+        const float spread = spread_of(plan, means, n, some), most = most_spread(plan, means, rows, columns, some);
+        const float taken = spread < (float)plan->hanging ? fminf(spread, most) : spread, square = taken * taken;
         largest = spread > largest ? spread : largest;
         if (beside)
             for (int k = 0; k < n; k++) length[k] += means[k] * means[k] / (square + beside[k] * beside[k]);

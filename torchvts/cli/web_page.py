@@ -16,11 +16,15 @@ from ..core.files import make_folder, write_image
 from ..model import Calibration, PointLights, Sensor, shipped_sensors
 from ..pipeline import DepthPipeline
 from ..scenes import render, sphere_press, undeformed
+from ..skin import ContactMask
 
 PACKAGE = Path(__file__).parents[1]
 HEIGHT, WIDTH, PITCH_MM = 120, 160, 0.12
 PORT = 8470
 """Of the page, where it is free: a browser keeps the permission for a camera, and the page without a network, by it."""
+
+ANY_SPREAD = 1e6
+"""For :data:`torchvts.skin.weight.MOST_SPREAD`: none."""
 
 
 def drawn_unit() -> tuple[DepthPipeline, Tensor]:
@@ -39,7 +43,10 @@ def prior_unit(sensor: Sensor) -> DepthPipeline:
     if prior is None:
         raise ValueError(f"sensor: expected one with a prior, '{sensor.name}' has none")
     light = prior.background(sensor.height, sensor.width, sensor.mm_per_pixel).float().clamp(0.0, 1.0)
-    return DepthPipeline.from_calibration(calibrate(light ** (1.0 / prior.response.gamma), sensor), "precise")
+    pipe = DepthPipeline.from_calibration(calibrate(light ** (1.0 / prior.response.gamma), sensor), "precise")
+    assert isinstance(pipe.mask, ContactMask)
+    pipe.mask.most_spread = ANY_SPREAD  # the light of units of a type differs smoothly, as that of skin that hangs
+    return pipe
 
 
 def write_plans(folder: Path, calibration: Calibration | None = None) -> None:

@@ -67,24 +67,25 @@ static float spread_of(const Plan *plan, const float *means, int n, float *some)
     return spread;
 }
 
-/* The most that the spread of means (rows, columns) may be: that of noise, which neighbours do not share. some: 2 n floats. */
-static float most_spread(const Plan *plan, const float *means, int rows, int columns, float *some) {
+/* The most of the spread of means (rows, columns) that is noise, which neighbours do not share. some: 2 n floats. */
+static float rough_spread(const Plan *plan, const float *means, int rows, int columns, float *some) {
     const int n = rows * (columns - 1);
     for (int y = 0, k = 0; y < rows; y++)
         for (int x = 1; x < columns; x++) some[k++] = fabsf(means[y * columns + x] - means[y * columns + x - 1]);
-    const float noise = n > 0 ? (float)plan->rough * sorted(some, some + n, n)[n / 2] : 0.0f;
-    return fmaxf(noise, (float)fmax(plan->most_spread, plan->least_spread));
+    return n > 0 ? (float)plan->rough * sorted(some, some + n, n)[n / 2] : 0.0f;
 }
 
 /* Length of vectors of `parts` planes (rows, columns), each in units of its spread; `beside` is a spread of its own that each has, or null. Returns the
    largest spread. */
 static WIDE float lengths(const Plan *plan, const float *means, int parts, const float *beside, int rows, int columns, float *some, float *length) {
     const int n = rows * columns;
+    const float least = (float)fmax(plan->most_spread, plan->least_spread);
     float largest = 0.0f;
     memset(length, 0, sizeof(float) * (size_t)n);
     for (int c = 0; c < parts; c++, means += n) {
-        const float spread = spread_of(plan, means, n, some), most = most_spread(plan, means, rows, columns, some);
-        const float taken = spread < (float)plan->hanging ? fminf(spread, most) : spread, square = taken * taken;
+        const float spread = spread_of(plan, means, n, some);
+        const int bounded = spread > least && spread < (float)plan->hanging; /* few frames are: noise need not be sorted for the others */
+        const float taken = bounded ? fminf(spread, fmaxf(rough_spread(plan, means, rows, columns, some), least)) : spread, square = taken * taken;
         largest = spread > largest ? spread : largest;
         if (beside)
             for (int k = 0; k < n; k++) length[k] += means[k] * means[k] / (square + beside[k] * beside[k]);

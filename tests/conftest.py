@@ -22,13 +22,26 @@ import torch
 
 import torchvts as vts
 from lab.drawn_sensors import DrawnSensor, drawn_sensor
-from torchvts import compiled
+from torchvts import compiled, viz
 from torchvts.cli import COMMANDS, main
 from torchvts.core.files import checksum, load_tensors
 
 ROOT = Path(__file__).resolve().parents[1]
 
 torch.set_num_threads(1)  # small tensors: a second thread gains nothing, and waits for a core where another process runs
+
+
+LONG = os.environ.get("TORCHVTS_TEST_PROFILE") == "long"
+"""Whether make test-long runs, which draws more examples."""
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _coarse_surfaces():
+    """Pictures draw surfaces of few points: those of a whole frame take a second each. make test-long draws them whole."""
+    with pytest.MonkeyPatch.context() as patch:
+        if not LONG:
+            patch.setattr(viz, "MOST_POINTS", 40)
+        yield
 
 
 @contextlib.contextmanager
@@ -93,6 +106,19 @@ def unit(tmp_path_factory):
     return path
 
 
+def calibrated(background, sensor, presses=()):
+    """A calibration, and what it warned of."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        calibration = vts.calibrate(background, sensor, presses)
+    return calibration, [str(one.message) for one in caught if issubclass(one.category, vts.CalibrationWarning)]
+
+
+def unlabelled(presses, **changes):
+    """Presses nobody has labelled, and with what else is to change."""
+    return [dataclasses.replace(press, center_px=None, contact_radius_px=None, **changes) for press in presses]
+
+
 @functools.cache
 def half_drawn(seed):
     """The drawn sensor of a seed with half of its rows and columns: a calibration of it takes a quarter of the time."""
@@ -100,6 +126,22 @@ def half_drawn(seed):
     sensor = whole.sensor
     size = {"height": sensor.height // 2, "width": sensor.width // 2, "mm_per_pixel": 2 * sensor.mm_per_pixel}
     return DrawnSensor(seed, dataclasses.replace(sensor, **size), whole.optics, whole.reach_mm)
+
+
+def unit_and_camera(lights, sensor, press):
+    """A calibrated unit, and its camera: press in mm and brightness to a picture (H, W, 3) B, G, R, 8 bits, with noise."""
+    scenes = {0.0: vts.scenes.undeformed(press()), 0.5: press(0.5), 1.0: press(1.0)}
+    rendered, taken = {mm: vts.scenes.render(scene, lights)[0] for mm, scene in scenes.items()}, []
+
+    def camera(press_mm=0.0, brightness=1.0, noise=0.004):
+        generator = np.random.default_rng(len(taken))
+        taken.append(press_mm)
+        image = rendered[press_mm].permute(1, 2, 0).flip(2).numpy() * brightness
+        image = image + noise * generator.standard_normal(image.shape, dtype=np.float32)
+        return (image.clip(0, 1) * 255 + 0.5).astype(np.uint8)
+
+    camera.restart = taken.clear
+    return vts.Calibration.from_lights(lights, sensor, rendered[0.0]), camera
 
 
 class Frames:

@@ -11,8 +11,6 @@ import torch
 
 from torchvts.cli.main import main
 
-ROOT = Path(__file__).resolve().parents[1]
-
 
 def blocks(path, kinds):
     """Fenced blocks of these kinds: (kind, text)."""

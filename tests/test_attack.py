@@ -1,4 +1,4 @@
-"""The attack, repeated: kernels at odd sizes and under sanitizers, states of other units. Files, calls and kills: test_fuzz."""
+"""The attack, repeated: kernels at odd sizes and under sanitizers. Files, calls and kills: test_fuzz."""
 
 import os
 import shutil
@@ -11,12 +11,10 @@ import pytest
 import test_frozen
 import test_fuzz
 import torch
-from conftest import ring_lights
 
 import torchvts as vts
 from torchvts.compiled import library
 from torchvts.compiled.binding import LIBRARY
-from torchvts.model.response_field import ResponseField, ResponseModel
 
 pytestmark = pytest.mark.long
 
@@ -86,40 +84,3 @@ def test_the_c_files_stay_within_their_memory(tmp_path):
     options = {"LD_PRELOAD": runtime, "ASAN_OPTIONS": "detect_leaks=0:abort_on_error=0:allocator_may_return_null=1"}
     done = run_python(program, watched, **options)
     assert done.returncode == 0, f"{done.stdout[-300:]} {done.stderr[-3000:]}"
-
-
-# ---- states ----
-
-
-def test_a_state_goes_into_a_pipeline_of_the_same_unit_only():
-    """Loaded, it gives what the pipeline gave that it is of; else it is refused."""
-    lights = ring_lights()
-    kinds = [
-        {}, {"gamma": 1.8}, {"mm_per_pixel": 0.5}, {"blur_px": 1.5}, {"height": 40}, {"width": 72}, {"markers": True},
-    ]  # fmt: skip
-    pipes = []
-    for kind in kinds:
-        sensor = vts.Sensor(**{"name": "rig", "height": 48, "width": 64, "mm_per_pixel": 0.6, **kind})
-        scene = vts.scenes.sphere_press(8.0, 1.0, (0, 0), sensor.height, sensor.width, sensor.mm_per_pixel)
-        background = vts.scenes.render(vts.scenes.undeformed(scene), lights, noise_std=0.004, seed=len(pipes))[0]
-        for mode in ("fast", "precise"):
-            for unit in (vts.Calibration.from_lights(lights, sensor), vts.Calibration.from_lights(lights, sensor, background)):
-                pipes.append((vts.DepthPipeline.from_calibration(unit, mode), vts.scenes.render(scene, lights)))
-        response = ResponseModel(ResponseField(0, -1, 20.0, ((0.3, 0.1, -0.2), (-0.1, 0.3, -0.1))), None, sensor.exponent, 1.0)
-        unit = vts.Calibration.from_response(response, sensor, background)
-        pipes.append((vts.DepthPipeline.from_calibration(unit), vts.scenes.render(scene, lights)))
-    pairs, loaded = 0, 0
-    for k, (of, image) in enumerate(pipes):
-        state, expected = of.state_dict(), of(image).depth_mm
-        for j, (into, _) in enumerate(pipes):
-            pairs += 1
-            before = {name: value.clone() for name, value in into.state_dict().items()}
-            try:
-                into.load_state_dict(state)
-            except (RuntimeError, ValueError, TypeError):
-                assert j != k
-                continue
-            loaded += 1
-            assert torch.equal(into(image).depth_mm, expected), (k, j)
-            into.load_state_dict(before)
-    assert loaded >= len(pipes)

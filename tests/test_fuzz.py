@@ -29,15 +29,14 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from conftest import ring_lights, write_film
+from conftest import LONG, ring_lights, write_film
 
 import torchvts as vts
 from torchvts.core.files import read_depth_png, write_atomically, write_depth_png
 from torchvts.model.response_field import ResponseField, ResponseModel
 
-LONG = os.environ.get("TORCHVTS_TEST_PROFILE") == "long"
 pytestmark = [pytest.mark.long] * LONG
-DAMAGES, OF_CLOUDS = (3000, 60) if LONG else (12, 1)
+DAMAGES, OF_CLOUDS = (3000, 60) if LONG else (6, 1)
 """Damages of a file; of a point cloud, which a process of its own reads."""
 CLOUDS = ("cloud.pcd", "text.pcd", "small.pcd", "cloud.ply", "text.ply") if LONG else ("small.pcd", "text.ply")
 MEMORY = 2**30
@@ -178,10 +177,11 @@ def damaged(content, rng):
     return bytes(data)
 
 
-def child(damaged_folder, claims_folder, count, seed):
-    """Read damaged files, then files with false claims, and print the outcome of each. Runs in a process of its own."""
+def child(saved_folder, damaged_folder, claims_folder, count, seed):
+    """Kill savers, then read damaged files and files with false claims, and print each outcome. Runs in a process of its own."""
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
+    kill_savers(saved_folder)
     used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (used + MEMORY, used + MEMORY))
     read_damaged(Path(damaged_folder), count, seed)
@@ -245,19 +245,25 @@ ENVIRONMENT = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.joi
 
 
 @pytest.fixture(scope="module")
-def outcomes(tmp_path_factory):
-    """What reading came to in a child process: (name, number or None, kind of error, text, length of the text) for each file."""
-    damaged_folder, claims_folder = (tmp_path_factory.mktemp(name) for name in ("damaged", "claims"))
-    write_whole_files(damaged_folder)
-    write_claims(claims_folder)
-    program = f"import test_fuzz\ntest_fuzz.child({str(damaged_folder)!r}, {str(claims_folder)!r}, {DAMAGES}, 0)"
+def printed(tmp_path_factory):
+    """The lines that a child process prints, which kills savers, and reads damaged files and those with false claims."""
+    folders = saved, damaged, claims = [tmp_path_factory.mktemp(name) for name in ("saved", "damaged", "claims")]
+    write_whole_files(damaged)
+    write_claims(claims)
+    program = f"import test_fuzz\ntest_fuzz.child(*{list(map(str, folders))!r}, {DAMAGES}, 0)"
     done = subprocess.run(
         [sys.executable, "-W", "ignore", "-c", program],
         env=ENVIRONMENT, capture_output=True, text=True, errors="replace", timeout=3600, check=False,
     )  # fmt: skip
-    lines = [line.split("] ", 1) for line in done.stdout.splitlines() if line.startswith('["')]
-    last = f"{lines[-1:]} (its file is in {damaged_folder} or {claims_folder})"
-    assert done.returncode == 0, f"the child died at {last}: {done.stderr[-800:]}"
+    lines = done.stdout.splitlines()
+    assert done.returncode == 0, f"the child died after {lines[-1:]} (files in {saved.parent}): {done.stderr[-2000:]}"
+    return lines
+
+
+@pytest.fixture(scope="module")
+def outcomes(printed):
+    """What reading came to: (name, number or None, kind of error, text, length of the text) for each file."""
+    lines = [line.split("] ", 1) for line in printed if line.startswith('["')]
     return [(*json.loads(head + "]"), *json.loads(tail)) for head, tail in lines]
 
 
@@ -479,9 +485,8 @@ def save_cloud(path, count):
 def kill_savers(folder):
     """For each kind of file, a fork that saves over an old one and is killed where the new one would take its place.
 
-    Runs in a process of its own, which has no threads.
+    Runs in a process that has no threads; prints each kind.
     """
-    torch.set_num_threads(1)
     for kind, (save, save_over) in savers().items():
         path = Path(folder) / kind
         save(path)
@@ -496,13 +501,11 @@ def kill_savers(folder):
         assert left.name.startswith(f".{path.stem}-") and left.suffix == path.suffix and left.stat().st_size > 0, left
         left.unlink()
         path.unlink()
-    print("whole")
+        print(f"{kind} is whole", flush=True)
 
 
-def test_a_kill_in_the_middle_of_a_save_leaves_a_whole_file(tmp_path):
-    program = f"import test_fuzz\ntest_fuzz.kill_savers({str(tmp_path)!r})"
-    done = subprocess.run([sys.executable, "-W", "ignore", "-c", program], env=ENVIRONMENT, capture_output=True, text=True)
-    assert done.returncode == 0 and done.stdout == "whole\n", done.stderr[-2000:]
+def test_a_kill_in_the_middle_of_a_save_leaves_a_whole_file(printed):
+    assert [line for line in printed if line.endswith(" is whole")] == [f"{kind} is whole" for kind in savers()]
 
 
 def test_what_a_killed_writer_leaves_is_no_frame(tmp_path):
@@ -547,7 +550,7 @@ def test_a_sample_of_bad_calls():
     before = Path.cwd()
     warnings.simplefilter("ignore")
     try:
-        wrong = [(case, found) for case, make in attack_calls.attack(10_000 if LONG else 600, "a sample") if (found := make())]
+        wrong = [(case, found) for case, make in attack_calls.attack(10_000 if LONG else 300, "a sample") if (found := make())]
     finally:
         os.chdir(before)
     assert wrong == []

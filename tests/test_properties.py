@@ -5,6 +5,7 @@ all tests of this file are marked long, draws hundreds of new ones and sends 10,
 """
 
 import hashlib
+import itertools
 import os
 import subprocess
 import sys
@@ -13,19 +14,18 @@ from pathlib import Path
 
 import pytest
 import torch
-from conftest import ring_lights
+from conftest import LONG, ring_lights
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
 import torchvts as vts
 from torchvts.model.response_field import ResponseModel
 
-LONG = os.environ.get("TORCHVTS_TEST_PROFILE") == "long"
 pytestmark = [pytest.mark.long] * LONG
 SLOW = [HealthCheck.too_slow, HealthCheck.data_too_large, HealthCheck.large_base_example]
 QUICK = (Phase.explicit, Phase.generate)  # to make the failing example small takes longer than all of them
 settings.register_profile(
-    "short", max_examples=6, deadline=None, derandomize=True, database=None, suppress_health_check=SLOW, phases=QUICK
+    "short", max_examples=4, deadline=None, derandomize=True, database=None, suppress_health_check=SLOW, phases=QUICK
 )
 settings.register_profile("long", max_examples=300, deadline=None, database=None, suppress_health_check=SLOW)
 settings.load_profile("long" if LONG else "short")
@@ -110,15 +110,6 @@ def random_gradient(height, width, seed, count=1):
 
 
 SOLVERS = {"PoissonDST": (3, vts.PoissonDST), "PoissonDCT": (2, vts.PoissonDCT), "PoissonBackground": (2, vts.PoissonBackground)}
-
-
-@given(st.integers(2, 40), st.integers(2, 40), small, small, st.integers(0, 99))
-def test_a_free_border_holds_a_tilt(height, width, p, q, seed):
-    gradient = random_gradient(height, width, seed)
-    tilt = torch.tensor([p, q], dtype=torch.float64).reshape(1, 2, 1, 1)
-    x, y = vts.core.geometry.pixel_grid_mm(height, width, 0.3, torch.float64)
-    expected = vts.poisson_dct(gradient, 0.3) + p * x + q * y
-    assert gap_mm(vts.poisson_dct(gradient + tilt, 0.3), expected) < 1e-10
 
 
 @given(st.sampled_from(sorted(SOLVERS)), st.integers(3, 40), st.integers(3, 40), st.floats(0.01, 9.0), st.integers(0, 99))
@@ -278,7 +269,7 @@ def test_threads_may_make_the_first_calls_of_a_pipeline():
     calibration = unit("response", 24, 32, 2.0 * PITCH)
     images = [press_image(calibration, kind) for kind in ("press", "border", "no contact", "holes")]
     alone = [vts.DepthPipeline.from_calibration(calibration)(image) for image in images]
-    for _ in range(8):
+    for _ in range(8 if LONG else 4):
         pipe = vts.DepthPipeline.from_calibration(calibration)
         found = in_threads([lambda k=k, pipe=pipe: [pipe(images[k]) for _ in range(3)] for k in range(len(images))])
         assert all(torch.equal(a, b) for k, outs in enumerate(found) for out in outs for a, b in zip(out, alone[k], strict=True))
@@ -306,7 +297,7 @@ def test_threads_may_share_an_integrator_for_several_sizes(name):
             assert (z - expected).abs().max() <= 8 * torch.finfo(z.dtype).eps * expected.abs().max()
 
 
-def digest(mode, by, kinds=KINDS if LONG else ("no contact", "press", "holes")):
+def digest(mode, by, kinds=KINDS if LONG else ("press", "holes")):
     """A hash of all bits that a pipeline gives."""
     calibration = unit(by)
     pipe = vts.DepthPipeline.from_calibration(calibration, mode)
@@ -316,12 +307,9 @@ def digest(mode, by, kinds=KINDS if LONG else ("no contact", "press", "holes")):
 
 
 def test_the_same_frames_give_the_same_bits():
-    here = [digest(mode, by) for mode in MODES for by in ("lights", "response")]
-    assert [digest(mode, by) for mode in MODES for by in ("lights", "response")] == here
-    program = (
-        "import torch, test_properties as t\ntorch.set_num_threads(1)\n"
-        "print(*[t.digest(mode, by) for mode in t.MODES for by in ('lights', 'response')])"
-    )
+    ways = list(itertools.product(MODES, ("lights", "response")))[:: 1 if LONG else 3]
+    here = [digest(*way) for way in ways]
+    program = f"import torch, test_properties as t\ntorch.set_num_threads(1)\nprint(*[t.digest(*way) for way in {ways}])"
     environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path])}
     done = subprocess.run(
         [sys.executable, "-W", "ignore", "-c", program], env=environment, capture_output=True, text=True, check=True

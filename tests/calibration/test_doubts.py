@@ -2,11 +2,10 @@
 
 import dataclasses
 import re
-import warnings
 
 import pytest
 import torch
-from conftest import half_drawn
+from conftest import calibrated, half_drawn, unlabelled
 
 import torchvts as vts
 from lab.drawn_sensors import drawn_sensor
@@ -22,17 +21,12 @@ UNIT = half_drawn(0)
 
 
 def bare(presses, times=1.0):
-    return [
-        dataclasses.replace(
-            p, ball_diameter_mm=times * p.ball_diameter_mm, center_px=None, contact_radius_px=None, name=f"ball {k}"
-        )
-        for k, p in enumerate(presses)
-    ]
+    named = [dataclasses.replace(p, ball_diameter_mm=times * p.ball_diameter_mm, name=f"ball {k}") for k, p in enumerate(presses)]
+    return unlabelled(named)
 
 
-@pytest.mark.parametrize(
-    "times, expected", [*(pytest.param(*right, marks=pytest.mark.long) for right in ((1.0, 0.63), (0.8, 0.77))), (0.5, 1.2)]
-)
+@pytest.mark.long  # test_sizes_that_all_presses_contradict has one quick case
+@pytest.mark.parametrize("times, expected", [(1.0, 0.63), (0.8, 0.77), (0.5, 1.2)])
 def test_the_width_of_contacts_knows_nothing_of_the_given_diameter(times, expected):
     """Halved diameters double it; located contact radii stop at 0.95 of the ball's."""
     whole = drawn_sensor(0)
@@ -72,11 +66,8 @@ def test_sizes_are_doubted_by_the_spread_of_units_and_of_presses():
 
 
 def test_a_wrong_background_is_named_with_its_place():
-    unit = {}
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        unit = vts.calibrate(UNIT.balls[0].image, UNIT.sensor, bare(UNIT.balls[4:8]))
-    (said,) = [str(w.message) for w in caught if "was a press given as the background?" in str(w.message)]
+    unit, warned = calibrated(UNIT.balls[0].image, UNIT.sensor, bare(UNIT.balls[4:8]))
+    (said,) = [text for text in warned if "was a press given as the background?" in text]
     place = torch.tensor([float(v) for v in re.search(r"pixel \((\d+), (\d+)\)", said).groups()])
     center, radius = torch.tensor(UNIT.balls[0].center_px), UNIT.balls[0].contact_radius_px
     assert float((place - center).norm()) < 1.3 * radius

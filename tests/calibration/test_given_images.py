@@ -1,11 +1,10 @@
 """Images that a calibration refuses, or leaves out, because they cannot be of one unit, taken in the same way."""
 
 import dataclasses
-import warnings
 
 import pytest
 import torch
-from conftest import half_drawn
+from conftest import calibrated, half_drawn
 
 import torchvts as vts
 from torchvts.calibration.given_images import sort_presses
@@ -146,10 +145,8 @@ def test_one_press_with_swapped_channels_is_left_out_by_name():
     unit = half_drawn(0)
     presses = [dataclasses.replace(ball, name=f"ball {k}") for k, ball in enumerate(unit.balls[:6])]
     presses[2] = dataclasses.replace(presses[2], image=presses[2].image.flip(0))
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        calibration = vts.calibrate(unit.background, unit.sensor, presses)
-    assert any(str(one.message).startswith("ball 2: left out: it has its channels swapped to the order B, G, R") for one in caught)
+    calibration, warned = calibrated(unit.background, unit.sensor, presses)
+    assert any(text.startswith("ball 2: left out: it has its channels swapped to the order B, G, R") for text in warned)
     rows = calibration.report["presses"]
     assert [row["name"] for row in rows] == [press.name for press in presses]
     assert not rows[2]["used"] and "swapped" in rows[2]["reason"] and rows[1]["used"]

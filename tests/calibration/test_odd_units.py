@@ -3,12 +3,12 @@
 import dataclasses
 import itertools
 import json
-import warnings
 
 import cv2
 import numpy as np
 import pytest
 import torch
+from conftest import calibrated
 
 import torchvts as vts
 from lab.prior import fit_log_background
@@ -91,14 +91,6 @@ def prior(light):
     return SensorPrior(ResponseModel(field, None), fit_log_background(light, PITCH), 0.5 * WIDTH * PITCH, "drawn")
 
 
-def calibrate(background, sensor, given=()):
-    """The calibration, and what was warned of."""
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        calibration = vts.calibrate(background, sensor, given)
-    return calibration, [str(w.message) for w in caught if issubclass(w.category, vts.CalibrationWarning)]
-
-
 def other_light():
     """The light of the prior's unit, unlike itself when turned or mirrored."""
     y, x = axes()
@@ -109,7 +101,7 @@ SLOW = ("pale", "smooth 1", "smooth 2", "smooth 3")
 """Up to ten seconds each: lights of every kind are tried for pale ones in any case, for smooth ones where nothing else is given.
 The first of the smooth ones, which is quicker, stands for the others."""
 
-NEITHER_SMOOTH_NOR_WHOLE = ("steps", "one channel dark")
+NOT_WHOLE = "one channel dark"
 
 
 def odd_cases():
@@ -117,7 +109,7 @@ def odd_cases():
     backgrounds = [*((name, False) for name in ODD), ("smooth 0", True), ("pale", True)]
     for (name, compressed), given in itertools.product(backgrounds, itertools.product((False, True), repeat=2)):
         if all(given):
-            quick = name in NEITHER_SMOOTH_NOR_WHOLE
+            quick = name == NOT_WHOLE
         elif any(given):
             quick = name == "smooth 0" and not compressed
         else:
@@ -131,7 +123,7 @@ def test_an_odd_background_gives_a_unit_that_can_be_used_or_a_refusal(name, comp
     background = jpeg(camera(light)) if compressed else camera(light)
     sensor = dataclasses.replace(SENSOR, prior=prior(other_light()) if with_prior else None)
     try:
-        calibration, _ = calibrate(background, sensor, presses(light) if with_presses else ())
+        calibration, _ = calibrated(background, sensor, presses(light) if with_presses else ())
     except ValueError as error:
         assert not with_presses and not with_prior, error
         assert "background: " in str(error) and ("give presses" in str(error) or "no coloured lights" in str(error))
@@ -190,14 +182,14 @@ CHANGED = {
 def test_a_turned_mirrored_or_swapped_background_is_named(change):
     sensor = dataclasses.replace(SENSOR, prior=prior(other_light()))
     image = CHANGED[change](camera(other_light()))
-    _, warned = calibrate(image, sensor)
+    _, warned = calibrated(image, sensor)
     assert any(f"it {change if change[:3] == 'has' else 'is ' + change} (" in text for text in warned), warned
 
 
 def test_a_prior_on_a_background_that_is_not_its_own_is_not_metric(tmp_path):
     sensor = dataclasses.replace(SENSOR, prior=prior(other_light()))
-    own, _ = calibrate(camera(other_light()), sensor)
-    other, _ = calibrate(camera(other_light()).flip(1, 2), sensor)
+    own, _ = calibrated(camera(other_light()), sensor)
+    other, _ = calibrated(camera(other_light()).flip(1, 2), sensor)
     other.save(tmp_path / "unit.safetensors")
     kept = vts.Calibration.load(tmp_path / "unit.safetensors")
     assert own.report["not_metric"] == [] and own.metric
@@ -223,12 +215,12 @@ def test_a_pattern_of_another_type_is_named():
 def test_presses_that_contradict_the_prior_calibrate_without_it():
     light = ODD["smooth 1"]
     foreign = dataclasses.replace(SENSOR, prior=prior(other_light()))
-    dropped, warned = calibrate(camera(light), foreign, presses(light, turned=True))
+    dropped, warned = calibrated(camera(light), foreign, presses(light, turned=True))
     assert "calibrated from 6 presses without the sensor's prior: " in dropped.report["reason"]
     assert any("calibrated from 6 presses without the sensor's prior: " in text for text in warned)
     assert all(row["used"] for row in dropped.report["presses"])
     wrong = dataclasses.replace(SENSOR, prior=prior(light))  # its background fits, its slopes have the other sign
-    dropped, warned = calibrate(camera(light), wrong, presses(light, turned=True))
+    dropped, warned = calibrated(camera(light), wrong, presses(light, turned=True))
     assert "without the sensor's prior: by the prior " in dropped.report["reason"]
 
 
@@ -249,12 +241,12 @@ def test_white_light_is_refused_by_presses_and_by_the_background():
     no_colours = "this sensor has no coloured lights: photometric depth is not possible"
     for sensor in (SENSOR, dataclasses.replace(SENSOR, prior=prior(other_light()))):
         with pytest.raises(ValueError, match=rf"presses: expected contacts that change the colour of the skin, .*: {no_colours}"):
-            calibrate(background, sensor, given)
+            calibrated(background, sensor, given)
         with pytest.raises(ValueError, match=rf"background: expected light whose colour varies .*: {no_colours}"):
-            calibrate(background, sensor)
+            calibrated(background, sensor)
     grey = background.mean(0, keepdim=True).expand(3, -1, -1)
     with pytest.raises(ValueError, match=r"background: expected an image in colour, .* a greyscale image\?"):
-        calibrate(grey, SENSOR)
+        calibrated(grey, SENSOR)
 
 
 def test_coloured_lights_that_are_pale_are_not_called_white():

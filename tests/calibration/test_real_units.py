@@ -1,10 +1,10 @@
 """Real GelSight Minis: what one image, a prior and presses are worth."""
 
 import dataclasses
-import warnings
 
 import pytest
 import torch
+from conftest import calibrated, unlabelled
 
 import torchvts as vts
 from lab import metrics
@@ -45,10 +45,7 @@ def test_presses_of_one_ball_calibrate_for_another(data, mini):
     small, large = ([p for p in presses if (p.ball_diameter_mm > 8) is big and p.contact_radius_px] for big in (False, True))
     prior = fit_prior(background, mini, small)
     sensor = dataclasses.replace(mini, prior=prior)
-    blind = [dataclasses.replace(p, center_px=None, contact_radius_px=None) for p in large[::2]]
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", vts.CalibrationWarning)
-        calibration = vts.calibrate(background, sensor, blind)
+    calibration, _ = calibrated(background, sensor, unlabelled(large[::2]))
     scores = []
     for press in large[1::2]:
         out = precise(calibration, press.image)
@@ -77,12 +74,10 @@ def test_backgrounds_of_the_type_are_not_named_and_turned_ones_are(data, mini):
 @pytest.mark.parametrize("place", [0, 12])
 def test_images_that_are_all_swapped_are_doubted_for_that_alone(data, mini, place):
     background, presses = vts.read_presses(data / "gelsight_mini_a")
-    press = dataclasses.replace(presses[place], image=presses[place].image.flip(0), center_px=None, contact_radius_px=None)
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        calibration = vts.calibrate(background.flip(0), mini, [press])
+    press = unlabelled([presses[place]], image=presses[place].image.flip(0))
+    calibration, warned = calibrated(background.flip(0), mini, press)
     (doubt,) = calibration.report["doubts"]
-    assert "it has its channels swapped to the order B, G, R (" in doubt and [str(one.message) for one in caught] == [doubt]
+    assert "it has its channels swapped to the order B, G, R (" in doubt and warned == [doubt]
     assert not calibration.metric
 
 
@@ -101,9 +96,7 @@ def test_presses_of_a_pale_unit_calibrate_although_the_prior_is_a_minis(data, mi
     folder = data / "gelsight_pale"
     sensor = vts.Sensor("pale", 320, 240, 1 / 19.58, prior=mini.prior)
     presses = [vts.Press(vts.read_image(folder / f"ball_{k:04}.png"), 4.7, str(k)) for k in range(1, 42, 8)]
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", vts.CalibrationWarning)
-        calibration = vts.calibrate(vts.read_image(folder / "background.png"), sensor, presses)
+    calibration, _ = calibrated(vts.read_image(folder / "background.png"), sensor, presses)
     assert "without the sensor's prior: the background does not have its pattern of light" in calibration.report["reason"]
     assert sum(row["used"] for row in calibration.report["presses"]) >= 5 and calibration.report["held_out_deg"] < 6.0
 
@@ -131,9 +124,7 @@ def test_a_marked_skin_is_calibrated_and_its_dots_stay_out_of_the_depth(data):
     sensor = vts.Sensor("marked", *background.shape[1:], 0.05, gamma=1.0, markers=True)
     names = ["sample_8", "sample_13", "sample_34", "sample_43"]
     presses = [vts.Press(vts.read_image(folder / f"{name}.jpg"), 5.0, name) for name in names]
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", vts.CalibrationWarning)
-        calibration = vts.calibrate(background, sensor, presses)
+    calibration, _ = calibrated(background, sensor, presses)
     assert calibration.markers is not None and all(row["used"] for row in calibration.report["presses"])
     assert calibration.report["held_out_deg"] < 4.0
 

@@ -2,11 +2,10 @@
 
 import dataclasses
 import re
-import warnings
 
 import pytest
 import torch
-from conftest import half_drawn
+from conftest import calibrated, half_drawn, unlabelled
 
 import torchvts as vts
 from lab.drawn_sensors import drawn_sensor
@@ -21,15 +20,11 @@ def drawn():
 
 def bare(presses=None):
     """Presses nobody labelled; half of the sensor's balls where none are given."""
-    presses = drawn().balls[:6] if presses is None else presses
-    return [dataclasses.replace(press, center_px=None, contact_radius_px=None) for press in presses]
+    return unlabelled(drawn().balls[:6] if presses is None else presses)
 
 
 def calibrate(sensor, presses):
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", CalibrationWarning)
-        calibration = vts.calibrate(drawn().background, sensor, presses)
-    return calibration, [str(warning.message) for warning in caught]
+    return calibrated(drawn().background, sensor, presses)
 
 
 @pytest.fixture(scope="module")

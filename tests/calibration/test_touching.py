@@ -4,6 +4,7 @@ import dataclasses
 
 import pytest
 import torch
+from conftest import unlabelled
 
 import torchvts as vts
 from lab.drawn_sensors import drawn_sensor
@@ -20,8 +21,7 @@ LONG = pytest.mark.long
 def test_a_unit_shows_how_its_skin_decays(reach_mm, expected_mm, tmp_path):
     """Light presses too are as large as they are then; with one L for all units contact was 1.3 to 5 times too large."""
     unit = dataclasses.replace(drawn_sensor(0), reach_mm=reach_mm)
-    presses = [dataclasses.replace(press, center_px=None, contact_radius_px=None) for press in unit.balls]
-    calibration = vts.calibrate(unit.background, unit.sensor, presses)
+    calibration = vts.calibrate(unit.background, unit.sensor, unlabelled(unit.balls[::2]))
     assert calibration.contact_decay_mm == pytest.approx(expected_mm, abs=0.03)
     calibration.save(tmp_path / "unit.safetensors")
     loaded = vts.Calibration.load(tmp_path / "unit.safetensors")

@@ -170,27 +170,22 @@ def test_what_to_expect_follows_the_source(rig, mini_by_prior):
     given = vts.Calibration.from_lights(lights, sensor, background)
     assert "presses of a ball would measure it" in expected(given)
     assert expected(mini_by_prior).startswith("normals within a contact to about 4.5 degrees, the mean over units that its prior")
-    held_out = {
-        "model": "response",
-        "source": "presses",
-        "held_out_deg": 1.5,
-        "stated_deg": 2.4,
-        "presses": [{"name": "a", "used": True}] * 12,
-    }
-    presses = vts.Calibration.from_response(mini_by_prior.response, mini_by_prior.sensor, mini_by_prior.background, held_out)
-    assert "to about 2.4 degrees anywhere on the skin: 1.5 on each of 12 presses by the others" in expected(presses)
     few = {"model": "response", "source": "presses", "held_out_deg": None, "presses": []}
-    fitted = vts.Calibration.from_response(mini_by_prior.response, mini_by_prior.sensor, mini_by_prior.background, few)
-    assert "5.0 degrees, a guess; presses" in expected(fitted)
-    one = dataclasses.replace(fitted, report=few | {"own_deg": 2.0, "stated_deg": 4.5, "presses": [{"name": "a", "used": True}]})
-    assert "4.5 degrees, by what so few presses leave open; more presses" in expected(one)
-    rough = vts.Calibration.from_response(
-        mini_by_prior.response,
-        mini_by_prior.sensor,
-        mini_by_prior.background,
-        {"model": "response", "source": "stand_in", "not_metric": ["lights"]},
-    )
-    assert "NOT METRIC" in expected(rough)
+    used = [{"name": "a", "used": True}]
+    for report, said in (
+        (few, "5.0 degrees, a guess; presses"),
+        (
+            few | {"own_deg": 2.0, "stated_deg": 4.5, "presses": used},
+            "4.5 degrees, by what so few presses leave open; more presses",
+        ),
+        (
+            few | {"held_out_deg": 1.5, "stated_deg": 2.4, "presses": 12 * used},
+            "to about 2.4 degrees anywhere on the skin: 1.5 on each of 12 presses by the others",
+        ),
+        ({"model": "response", "source": "stand_in", "not_metric": ["lights"]}, "NOT METRIC"),
+    ):
+        unit = vts.Calibration.from_response(mini_by_prior.response, mini_by_prior.sensor, mini_by_prior.background, report)
+        assert said in expected(unit)
 
 
 def test_a_video_or_a_folder_in_the_wrong_place_names_the_way_that_works(rig, tmp_path):

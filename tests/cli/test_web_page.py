@@ -1,11 +1,9 @@
 """torchvts view --web: the page with its plans, for this machine alone."""
 
 import json
-import os
 import signal
 import socket
-import subprocess
-import sys
+import threading
 import urllib.request
 
 import pytest
@@ -29,31 +27,41 @@ def own_address():
 
 
 @pytest.mark.skipif(not any(path.is_file() for path in BUILT), reason="no torchvts.wasm: make wasm builds it")
-def test_the_page_is_served_to_this_machine_alone(tmp_path):
+def test_the_page_is_served_to_this_machine_alone(tmp_path, monkeypatch, run_script):
     lights = vts.PointLights([[20, 0, 30], [-10, 17, 30], [-10, -17, 30]], [900, 900, 900])
     vts.Calibration.from_lights(lights, vts.Sensor("mine", 48, 64, 0.5)).save(tmp_path / "unit.safetensors")
-    # shells let commands in the background ignore Ctrl-C, and so would what these start
-    program = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); from torchvts.cli import main; exit(main())"
-    command = [sys.executable, "-W", "ignore", "-c", program, "view", "--web", str(tmp_path / "unit.safetensors")]
-    environment = os.environ | {"BROWSER": "true"}
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) as running:
+    answers, failed = {}, []
+
+    def visit(port):
+        """What a browser and another machine do; then Ctrl-C."""
         try:
-            address = running.stdout.readline().split(" ")[0]
-            port = int(address.rpartition(":")[2])
-            with urllib.request.urlopen(f"http://127.0.0.1:{port}/plans.json") as answer:
-                plans = json.load(answer)
-            for name in ("", "app.js", "torchvts.wasm", "demo.png", *(plan["file"] for plan in plans)):
+            names = ["plans.json", "", "app.js", "torchvts.wasm", "demo.png"]
+            for name in names:
                 with urllib.request.urlopen(f"http://127.0.0.1:{port}/{name}") as answer:
-                    content = answer.read()
-                    assert content and answer.headers["Cache-Control"] == "no-cache"
+                    answers[name] = answer.read()
+                    assert answers[name] and answer.headers["Cache-Control"] == "no-cache"
+                if name == "plans.json":
+                    names += [plan["file"] for plan in json.loads(answers[name])]
             outside = own_address()
             if outside not in (None, "127.0.0.1"):
                 with pytest.raises(OSError):
                     socket.create_connection((outside, port), timeout=5)
-            running.send_signal(signal.SIGINT)
-            assert running.wait(30) == 130
+        except BaseException as error:
+            failed.append(error)
         finally:
-            running.kill()
+            signal.raise_signal(signal.SIGINT)
+
+    def opened(address):
+        threading.Thread(target=visit, args=(int(address.rpartition(":")[2]),)).start()
+
+    monkeypatch.setattr("webbrowser.open", opened)
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # shells let commands in the background ignore Ctrl-C
+    try:
+        done = run_script("view", "--web", tmp_path / "unit.safetensors")
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert failed == [] and done.returncode == 130 and " shows the page, on this machine alone" in done.stdout, done.stderr
+    plans = json.loads(answers["plans.json"])
     assert [plan["name"] for plan in plans] == ["mine, calibrated", "digit, by its prior", "gelsight_mini, by its prior"]
     assert plans[0]["prior_deg"] is None and 4.0 < plans[2]["prior_deg"] < 5.0
 

@@ -373,10 +373,6 @@ def in_double(pipe):
     pipe.double()
 
 
-def glossy(pipe):
-    pipe.solve.normals.lights.gloss.fill_(0.3)
-
-
 OWN = {
     "mask is Own": of_own_class,
     "solve.zero.offset is replaced": with_a_method,

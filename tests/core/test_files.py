@@ -178,14 +178,20 @@ def test_animations_are_refused_and_not_read_by_their_first_frame(tmp_path, cont
         vts.read_image(tmp_path / "film.png")
 
 
-def test_missing_and_broken_sources_are_refused(tmp_path):
-    with pytest.raises(ValueError, match="no images in this folder"):
-        vts.frames(tmp_path)
+@pytest.mark.parametrize("read", [lambda path: list(vts.frames(path)), streams.open_source])
+def test_missing_and_broken_sources_are_refused(tmp_path, read):
+    with pytest.raises(ValueError, match="no images"):
+        read(tmp_path)
     with pytest.raises(FileNotFoundError, match="nowhere: no such file or folder"):
-        vts.frames(tmp_path / "nowhere")
-    (tmp_path / "film.avi").write_bytes(b"no film")
-    with pytest.raises(ValueError, match=r"film\.avi: not a video, or cut short"):
-        list(vts.frames(tmp_path / "film.avi"))
+        read(tmp_path / "nowhere")
+    for name, content, message in (
+        ("text.txt", b"no film", "expected a video, an image or a container"),
+        ("film.avi", b"no film", "not a video"),
+        ("cut.avi", b"RIFF0000AVI ", "not a video"),
+    ):
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(ValueError, match=rf"{name}: .*{message}"):
+            read(tmp_path / name)
 
 
 @pytest.fixture(scope="module")

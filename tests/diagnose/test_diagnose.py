@@ -4,17 +4,17 @@ All that triggers stands in :data:`TRIGGERS`, all that must not in :data:`ORDINA
 """
 
 import dataclasses
+import functools
 import json
 import re
 import warnings
 
 import pytest
 import torch
-from conftest import ROOT, ring_lights
+from conftest import ROOT, half_drawn, ring_lights
 
 import torchvts as vts
 from lab import sets
-from lab.drawn_sensors import drawn_sensor
 from lab.gallery import CORRUPTIONS, undisturbed
 from lab.training import Training
 from torchvts import scenes
@@ -24,6 +24,7 @@ from torchvts.diagnose.checks import CHECKS
 from torchvts.model.response_field import ResponseModel
 
 SIZE = {"height": 120, "width": 160, "mm_per_pixel": 0.25}
+undisturbed = functools.cache(undisturbed)
 
 # ---- frames that trigger a finding: functions of a seed that give (background or None, image, calibration) --------------------
 
@@ -110,7 +111,7 @@ def softened(image, seed):
 
 
 def little_known(seed):
-    unit = drawn_sensor(31)
+    unit = half_drawn(31)
     balls = [unit.ball(5.0, 0.3 + 0.2 * k, (0.5 * k - 1.0, 0.3 * k - 0.5), f"{k}", k) for k in range(4)]
     calibration = vts.calibrate(unit.background, unit.sensor, balls)
     unsure = dataclasses.replace(calibration, covariance=100.0 * calibration.covariance)
@@ -218,7 +219,7 @@ def test_every_finding_of_the_table_is_triggered_and_has_a_row_in_the_page():
     assert names == {name for row in rows[1:] for name in row.split(", ")}
 
 
-@pytest.mark.parametrize("fitted", [False, True])
+@pytest.mark.parametrize("fitted", [False, pytest.param(True, marks=pytest.mark.long)])
 def test_ordinary_drawn_frames_raise_no_alarm(fitted, small_sensor):
     lights = ring_lights(rotation_deg=40.0, level=0.4)
     sensor = small_sensor if fitted else vts.Sensor("rig", 120, 160, 0.25, gamma=1.0)
@@ -233,7 +234,7 @@ def test_ordinary_drawn_frames_raise_no_alarm(fitted, small_sensor):
     assert vts.diagnose(None, again, unit).names == ("no_contact",)
 
 
-@pytest.mark.parametrize("seed", [0, 2])
+@pytest.mark.parametrize("seed", [0, pytest.param(2, marks=pytest.mark.long)])
 def test_undisturbed_frames_of_the_gallery_have_no_finding(seed):
     case = undisturbed(seed)
     assert vts.diagnose(case.background, case.image, case.calibration).findings == ()
@@ -301,7 +302,7 @@ def test_a_failed_led_of_the_background_is_named_and_no_contact(mini_presses, mi
             assert says in next(finding.message for finding in found if finding.name == name)
 
 
-@pytest.mark.parametrize("share", [0.12, 0.5])
+@pytest.mark.parametrize("share", [0.12, pytest.param(0.5, marks=pytest.mark.long)])
 def test_a_dimmer_channel_and_a_darker_image_are_measured_and_cost_nothing(share):
     case = undisturbed(3)
     for factor in ((1.0, 1.0, 1.0 - share), (1.0 - share,) * 3):
@@ -379,7 +380,7 @@ def test_the_command_sums_up_a_folder(tmp_path, run_script):
 
 def test_the_command_cuts_raw_frames_as_reconstruct_does(tmp_path, run_script):
     sensor = dataclasses.replace(vts.Sensor.load("gelsight_mini"), prior=None)
-    height, width = sensor.raw_size_px[0]
+    height, width = sensor.raw_size_px[1]
     raw = torch.rand(3, height // 8, width // 8, generator=torch.Generator().manual_seed(0))
     raw = torch.nn.functional.interpolate(0.3 + 0.3 * raw[None], (height, width), mode="bilinear")[0]
     vts.Calibration.from_response(ResponseModel.zero(), sensor, sensor.rectify(raw[None])[0]).save(tmp_path / "unit.safetensors")

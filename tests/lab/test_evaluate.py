@@ -125,20 +125,41 @@ def test_a_tilted_depth_moves_the_fitted_ball(press):
     assert score.center_px == pytest.approx(slope * 0.5 * BALL_MM / PITCH, rel=0.15)
 
 
+OWN = """
+import torch
+from torchvts import NormalFromResponse, DepthPipeline
+
+def normals(training):
+    return NormalFromResponse.from_calibration(training.calibration)
+
+def depth(training):
+    pipe = DepthPipeline.from_calibration(training.calibration)
+    return lambda images: pipe(images).depth_mm
+"""
+
+
 def test_accuracy_writes_tables_rows_and_pictures(run_script, monkeypatch, folder, tmp_path):
+    """Beside the methods, the calibrated model itself, given as networks of one's own, which has its scores."""
     monkeypatch.setattr(methods, "train_network", partial(train_network, max_epochs=15))
-    done = run_script("accuracy", folder, "--sensor", folder / "rig.yaml", "--folds", 2, "--out", tmp_path)
+    (tmp_path / "own_networks.py").write_text(OWN)
+    monkeypatch.syspath_prepend(tmp_path)
+    own = ("own_networks:normals", "own_networks:depth")
+    options = ("--normals", own[0], "--depth", own[1], "--folds", 2, "--out", tmp_path)
+    done = run_script("accuracy", folder, "--sensor", folder / "rig.yaml", *options)
     assert done.returncode == 0, done.stderr
     document = json.loads((tmp_path / "scores.json").read_text())
     summary = {row["method"]: row for row in document["rows"]}
-    assert list(summary) == [name for name in ev.COMPARED if "no prior" not in name]  # the file has none
+    assert list(summary) == [*(name for name in ev.COMPARED if "no prior" not in name), *own]  # the file has none
+    for name in ("depth_normal_deg", "relief_um"):
+        same = [summary[method]["errors"][name] for method in ("fast", *own)]
+        assert same == pytest.approx([same[0]] * 3, rel=0.05), (name, [row["note"] for row in summary.values()])
     assert len(document["scores"]) == 5 * len(summary) and document["command"].startswith("python scripts/accuracy.py ")
     # exact lights, little noise: the model is right, and learning from three presses beats zero depth
     assert summary["point lights"]["errors"]["normal_deg"] < 1.5
     assert summary["precise"]["errors"]["normal_deg"] < 3.0 and summary["precise"]["errors"]["level_um"] < 20.0
     for name in ("look-up table", "MLP"):
         assert summary[name]["errors"]["normal_deg"] < 0.8 * summary["flat"]["errors"]["normal_deg"]
-    for name in ("fast", "precise", "look-up table", "MLP"):
+    for name in ("fast", "precise", "look-up table", "MLP", own[0]):
         errors, note = summary[name]["errors"], summary[name]["note"]
         assert (errors["used"], errors["given"]) == (6, 6) and "Error" not in note
     assert summary["flat"]["errors"]["radius_percent"] is None and summary["flat"]["errors"]["iou"] == 0.0
@@ -160,41 +181,13 @@ def test_evaluate_with_a_trained_network(run_script, folder, tmp_path):
     assert result.rows[0].errors["normal_deg"] < 3.0 and result.rows[1].frames == 4
 
 
-OWN = """
-import torch
-from torchvts import NormalFromResponse, DepthPipeline
-
-def normals(training):
-    return NormalFromResponse.from_calibration(training.calibration)
-
-def depth(training):
-    pipe = DepthPipeline.from_calibration(training.calibration)
-    return lambda images: pipe(images).depth_mm
-"""
-
-
-def test_networks_of_ones_own_are_scored_beside_the_methods(run_script, monkeypatch, folder, tmp_path):
-    """The calibrated model itself, given as one's own, has its scores."""
-    (tmp_path / "own_networks.py").write_text(OWN)
-    monkeypatch.syspath_prepend(tmp_path)
-    options = ("--normals", "own_networks:normals", "--depth", "own_networks:depth", "--methods", "fast", "--folds", 2)
-    done = run_script("accuracy", folder, "--sensor", folder / "rig.yaml", "--out", tmp_path, *options)
-    assert done.returncode == 0, done.stderr
-    found = {row["method"]: row for row in json.loads((tmp_path / "scores.json").read_text())["rows"]}
-    assert list(found) == ["fast", "own_networks:normals", "own_networks:depth"]
-    for name in ("depth_normal_deg", "relief_um"):
-        same = [found[method]["errors"][name] for method in found]
-        assert same == pytest.approx([same[0]] * 3, rel=0.05), (name, [row["note"] for row in found.values()])
-    assert found["own_networks:normals"]["errors"]["used"] == 6
-    for text, message in (("own_networks", "expected module:factory"), ("own_networks:other", "expected a function other in")):
-        assert message in run_script("accuracy", folder, "--normals", text).stderr
-
-
-def test_networks_of_ones_own_are_found_in_the_working_folder(monkeypatch, tmp_path):
+def test_networks_of_ones_own_are_found_in_the_working_folder_or_named(run_script, folder, monkeypatch, tmp_path):
     (tmp_path / "networks_here.py").write_text(OWN)
     monkeypatch.setattr(sys, "path", list(sys.path))
     monkeypatch.chdir(tmp_path)
     assert [method.name for method in methods.own_methods("networks_here:normals", None)] == ["networks_here:normals"]
+    for text, message in (("networks_here", "expected module:factory"), ("networks_here:other", "expected a function other in")):
+        assert message in run_script("accuracy", folder, "--normals", text).stderr
     with pytest.raises(ImportError, match=r"no_networks:normals: expected no_networks\.py in .+ or on PYTHONPATH, found none"):
         methods.own_methods("no_networks:normals", None)
 

@@ -16,12 +16,7 @@ def row(method, ms, rms_um, kind="scene", height=480, data="sphere R 10 mm, pres
     return Row(kind, method, data, {"rms_um": rms_um, "normal_deg": rms_um}, size, time, ours=ours)
 
 
-ROWS = [
-    row("fast", 1.0, 3.0),
-    row("precise", 2.0, 1.0),
-    row("flat", 0.1, 500.0),
-    row(speed.GS_SDK, 9.0, None),
-]
+ROWS = [row("fast", 1.0, 3.0), row("precise", 2.0, 1.0), row("flat", 0.1, 500.0), row(speed.GS_SDK, 9.0, None)]
 
 
 def test_scenes_are_timed_and_scored(monkeypatch):

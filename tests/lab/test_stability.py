@@ -1,16 +1,15 @@
 """The sweep over hard scenes: what it measures, that it goes on where it stopped, and that no breaking point has moved."""
 
 import itertools
-from pathlib import Path
 
 import pytest
+from conftest import ROOT
 
 from lab import stability
 from lab.gallery import CORRUPTIONS, undisturbed
 from lab.rows import Row
 from lab.stability import MASK, SWEPT
 
-ROOT = Path(__file__).resolve().parents[2]
 POINTS, SEEDS = stability.points_from_json((ROOT / "tests" / "breaking_points.json").read_text())
 
 

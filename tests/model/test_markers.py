@@ -3,6 +3,7 @@
 import cv2
 import pytest
 import torch
+from conftest import ring_lights
 from torch import nn
 
 import torchvts as vts
@@ -30,8 +31,6 @@ def dots(spacing=20.0, long=4.5, short=3.0, push=0.0, dtype=torch.float32):
 
 def frame(press_mm=0.0, depth=0.45, noise=NOISE, seed=0, dtype=torch.float32, **how):
     """A frame with markers, the same without them and without noise, and the markers' pixels."""
-    from conftest import ring_lights
-
     scene = vts.scenes.sphere_press(8.0, press_mm or 1.0, (1.0, -0.5), HEIGHT, WIDTH, PITCH, dtype)
     scene = scene if press_mm else vts.scenes.undeformed(scene)
     clean = vts.scenes.render(scene, ring_lights(dtype=dtype))

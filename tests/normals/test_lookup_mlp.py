@@ -183,12 +183,8 @@ def test_without_smoothing_each_bin_is_the_mean_of_its_pixels():
     ],
 )
 def test_a_bad_table_is_refused(change, message, tmp_path):
-    good = {
-        "flat": torch.zeros(3, 4, 4),
-        "table": torch.zeros(4, 4, 4, 2),
-        "step": torch.ones(3),
-        "zero_index": torch.tensor([1, 1, 1]),
-    }
+    good = {"flat": torch.zeros(3, 4, 4), "table": torch.zeros(4, 4, 4, 2), "step": torch.ones(3)}
+    good["zero_index"] = torch.tensor([1, 1, 1])
     save_tensors(tmp_path / "bad.safetensors", good | change, {"kind": "lookup_table"})
     with pytest.raises(ValueError, match=rf"bad\.safetensors: damaged: {message}"):
         NormalFromLookup.load(tmp_path / "bad.safetensors")

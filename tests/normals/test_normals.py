@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import references
 import torch
+from conftest import LONG
 
 import torchvts as vts
 from lab import metrics
@@ -22,11 +23,6 @@ def block_for(lights, scene, **options):
 
 def rms_deg(normal, scene, region):
     return float(metrics.normal_angle_deg(normal, scene.normal, region).square().mean().sqrt())
-
-
-def test_the_flat_inverse_is_exact_on_undeformed_skin(ring):
-    scene, lights = scenes.undeformed(press()), ring(dtype=torch.float64)
-    assert metrics.normal_angle_deg(block_for(lights, scene)(scenes.render(scene, lights)), scene.normal).max() < 1e-12
 
 
 def test_the_flat_inverse_is_exact_for_slopes_without_depth(ring):
@@ -194,4 +190,4 @@ def test_derivatives_in_image_depth_and_lights(ring, with_depth, gloss):
         return torch.func.functional_call(block, names, (image, *depth))
 
     inputs = [scenes.render(scene, lights), lights.position_mm.clone(), lights.albedo.clone(), *([depth] if with_depth else [])]
-    assert torch.autograd.gradcheck(normals, [value.requires_grad_(True) for value in inputs])
+    assert torch.autograd.gradcheck(normals, [value.requires_grad_(True) for value in inputs], fast_mode=not LONG)

@@ -29,6 +29,7 @@ def test_first_depth(data, empty_folder):
     assert float(names["height"]) == pytest.approx(float(names["expected"]), rel=0.15)
     assert len(names["points"]) == int(names["out"].contact.sum())
     assert (empty_folder / "out" / "press" / "frames.csv").is_file()
+    assert (empty_folder / "out" / "press" / "gelsight_picture.png").stat().st_size > 10_000
 
 
 def test_coming_from_gs_sdk(data, empty_folder):
@@ -59,9 +60,9 @@ def test_the_page_on_data_sets(empty_folder, ring):
     with VideoFile("film.avi", 30.0) as film:
         for _ in range(15):
             film.write(np.ascontiguousarray(pixels))
-    reconstruct_dataset("unit.safetensors", "out/frames/0.png", "out/press")
+    reconstruct_dataset("unit.safetensors", "out/frames/0.png", "out/press", pictures=False)
     (empty_folder / "out" / "press" / "0.npz").rename("out/press/press.npz")
-    reconstruct_dataset("unit.safetensors", "film.avi", "out/film", format="video-npz")
+    reconstruct_dataset("unit.safetensors", "film.avi", "out/film", format="video-npz", pictures=False)
     names = run(ROOT / "docs" / "datasets.md")
     assert len(names["deepest_mm"]) == 15 and float(names["result"].depth_mm.max()) == pytest.approx(0.5, rel=0.1)
     assert torch.allclose(next(iter(names["pairs"]))[1], names["result"].depth_mm[0], atol=1e-6)

@@ -8,10 +8,10 @@ import warnings
 
 import pytest
 import torch
+from conftest import LONG, half_drawn
 
 import torchvts as vts
 from lab import coverage
-from lab.drawn_sensors import drawn_sensor
 from lab.metrics import normal_angle_deg
 from lab.score import Truth
 from torchvts.export import sample_frames
@@ -62,7 +62,7 @@ def test_levels_are_those_of_gaussian_errors(spread, dimensions):
 def test_noise_and_conditioning_against_many_noisy_frames(ring, noise_std, rise):
     calibration, _, camera = lights_unit(ring, noise_std, background=False, height_mm=rise, radius_mm=35.0)
     pipe = vts.ConfidentPipeline.from_calibration(calibration, "fast")
-    still, out = pipe(camera(0, 0.0)), pipe(torch.cat([camera(seed) for seed in range(60)]))
+    still, out = pipe(camera(0, 0.0)), pipe(torch.cat([camera(seed) for seed in range(30)]))
     inside = still.contact & out.contact.all(0, keepdim=True)
     quiet = still.factors_deg[:, FACTORS.index("model")][:, None] == 0  # no light is blocked
     angle = normal_angle_deg(out.normal, still.normal.expand_as(out.normal))
@@ -73,15 +73,18 @@ def test_noise_and_conditioning_against_many_noisy_frames(ring, noise_std, rise)
     assert float((stated / found).quantile(0.02)) > 0.6 and float((stated / found).quantile(0.98)) < 1.6
 
 
-SEEDS = {"lights known": 20000, "lights known, background": 21000, "lights fitted": 22000}
+SEEDS = {
+    "lights known": range(20000, 20024),
+    "lights known, background": range(21000 if LONG else 21010, 21024),
+    "lights fitted": range(22000, 22010),
+}
 
 
 @pytest.fixture(
     scope="module", params=[pytest.param(kind, marks=[] if "background" in kind else [pytest.mark.long]) for kind in SEEDS]
 )
 def covered(request):
-    first = SEEDS[request.param]
-    return coverage.of_scenes(range(first, first + (10 if "fitted" in request.param else 24)), request.param)
+    return coverage.of_scenes(SEEDS[request.param], request.param)
 
 
 def test_95_percent_of_random_scenes_lie_within_the_bounds(covered):
@@ -192,7 +195,7 @@ def test_a_field_of_which_nothing_is_known(case):
 @pytest.fixture(scope="module")
 def drawn():
     """A drawn sensor calibrated by presses of 0.3 to 1 mm, and another press (1, 3, H, W)."""
-    unit = drawn_sensor(31)
+    unit = half_drawn(31)
     presses = ((0.3, (-3.0, 0.0)), (0.3, (3.0, 0.0)), (0.35, (0.0, 0.0)), (1.0, (0.0, 2.0)), (1.0, (1.0, -2.0)))
     named = [unit.ball(5.0, depth_mm, place, f"{k}", k) for k, (depth_mm, place) in enumerate(presses)]
     calibration = vts.calibrate(unit.background, unit.sensor, named)
@@ -204,7 +207,7 @@ def test_bounds_grow_with_slopes_that_the_presses_did_not_show(drawn):
     out = vts.ConfidentPipeline.from_calibration(calibration, "precise")(frames)
     model = out.factors_deg[:, FACTORS.index("model")][:, None]
     sine = out.normal[:, :2].norm(dim=1, keepdim=True)
-    steep, gentle = (sine > 0.5) & out.contact, (sine < 0.2) & out.contact
+    steep, gentle = (sine > 0.4) & out.contact, (sine < 0.2) & out.contact
     assert float(model[steep].mean()) > 1.05 * float(model[gentle].mean())
     twice = vts.ConfidentPipeline.from_calibration(dataclasses.replace(calibration, covariance=4.0 * calibration.covariance))(
         frames
@@ -226,7 +229,7 @@ def test_frames_that_no_surface_explains_have_wider_bounds(drawn):
     calibration, frames = drawn
     pipe = vts.ConfidentPipeline.from_calibration(calibration, "precise")
     surface, plain = FACTORS.index("surface"), pipe(frames)
-    stripes = 1.0 + 0.1 * torch.sin(torch.arange(frames.shape[2]) * 0.4)[:, None] * torch.tensor([1.0, -1.0, 0.5])[:, None, None]
+    stripes = 1.0 + 0.1 * torch.sin(torch.arange(frames.shape[2]) * 0.8)[:, None] * torch.tensor([1.0, -1.0, 0.5])[:, None, None]
     disturbed = pipe((frames * torch.where(plain.contact, stripes, 1.0)).clamp(0, 1))
     both = plain.contact & disturbed.contact
     ratio = (disturbed.factors_deg / plain.factors_deg.clamp_min(1e-6))[:, surface : surface + 1][both].median()
@@ -308,7 +311,7 @@ def test_presses_of_a_real_sensor(mini_presses, mini_by_prior, learn):
     sensor = vts.Sensor.load("gelsight_mini")
     calibration = vts.calibrate(background, sensor.without_prior(), learned) if learn else mini_by_prior
     pipe = vts.ConfidentPipeline.from_calibration(calibration, "precise")
-    scored = [press for press in presses if press.contact_radius_px is not None and press.name not in names]
+    scored = [press for press in presses if press.contact_radius_px is not None and press.name not in names][:: 1 if learn else 3]
     rows = []
     for press in scored:  # labels give the place of a ball, not its depth: the relief is compared
         truth = ball_truth(press, sensor.height, sensor.width, sensor.mm_per_pixel)

@@ -58,17 +58,8 @@ def test_clouds_of_a_data_set(places, run_script):
     for name, options in (("beside", ()), ("on", ("--unit", "m"))):
         for kind in ("ply", "obj"):
             out = places / f"{name}_{kind}"
-            done = run_script(
-                "reconstruct",
-                places / f"{name}.safetensors",
-                places / "3.png",
-                "--out",
-                out,
-                "--no-pictures",
-                "--cloud",
-                kind,
-                *options,
-            )
+            given = (places / f"{name}.safetensors", places / "3.png", "--out", out, "--no-pictures", "--cloud", kind)
+            done = run_script("reconstruct", *given, *options)
             assert done.returncode == 0, done.stderr
     (_, points, normals), (says, there, turned) = (read_ply(places / f"{name}_ply" / "3.ply") for name in ("beside", "on"))
     assert says == "m, axes of the robot" == json.loads((places / "on_ply" / "summary.json").read_text())["clouds"]

@@ -1,5 +1,6 @@
 """Motion of printed dots: exact where it must be, never a dot that is not there, and as sure as it says."""
 
+import dataclasses
 import functools
 import math
 
@@ -25,6 +26,7 @@ def motion_of(skin, dtype=torch.float32, camera_mm=None):
     return SkinMotion(background, find_dots(background, markers), markers.diameter_px, PITCH, camera_mm)
 
 
+@functools.cache
 def frame(skin, drag, seed=0, left=None, dtype=torch.float32):
     return skin.image(drag, seed, left)[None].to(dtype), skin.depth_mm(drag).to(dtype)
 
@@ -160,7 +162,7 @@ def test_gradients_are_those_of_difference_quotients(camera_height_mm):
             assert float((slopes[k] * ways[k]).sum()) == pytest.approx(quotient, rel=2e-2, abs=1e-3)
 
 
-@pytest.mark.parametrize("noise_std", [1.5 / 255.0, 6.0 / 255.0])
+@pytest.mark.parametrize("noise_std", [1.5 / 255.0, pytest.param(6.0 / 255.0, marks=pytest.mark.long)])
 def test_errors_are_as_large_as_stated(noise_std):
     skin = DottedSkin(**SIZE, noise_std=noise_std)
     motion = motion_of(skin)
@@ -252,8 +254,6 @@ def test_a_skin_without_dots_is_refused(background):
 
 
 def test_a_calibration_whose_dots_are_filled_says_so():
-    import dataclasses
-
     with pytest.raises(ValueError, match="got one in which they are filled: calibrate the unit again"):
         SkinMotion.from_calibration(dataclasses.replace(unit(DottedSkin(**SIZE)), printed=None))
 

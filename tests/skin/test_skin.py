@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from conftest import LONG
 from torch import Tensor
 
 from torchvts import Calibration, ContactFromDepth, ContactMask, DepthPipeline, PointLights, Sensor, near_field_shading
@@ -164,20 +165,18 @@ def test_gradients_are_exact(block):
         y, x = torch.meshgrid(torch.linspace(-1, 1, 16), torch.linspace(-1, 1, 20), indexing="ij")
         bump = 0.02 * torch.exp(-8 * (x * x + y * y)).double()
         image = (0.5 + torch.stack((bump, -bump, 0.3 * bump)) + 0.002 * torch.randn(3, 16, 20).double())[None].requires_grad_(True)
-        assert torch.autograd.gradcheck(ContactMask(torch.full((3, 16, 20), 0.5).double()), (image,), atol=1e-4)
+        assert torch.autograd.gradcheck(ContactMask(torch.full((3, 16, 20), 0.5).double()), (image,), atol=1e-4, fast_mode=not LONG)
     else:
         weight = torch.full((1, 1, 12, 16), 0.05).double()
         weight[..., 3:9, 4:12] = 0.9
         weight += 0.05 * torch.rand(weight.shape).double()
         depth = (weight + 0.1 * torch.rand(1, 1, 12, 16)).double().requires_grad_(True)
-        assert torch.autograd.gradcheck(ZeroBackground(0.2), (depth, weight.requires_grad_(True)), atol=1e-4)
+        assert torch.autograd.gradcheck(ZeroBackground(0.2), (depth, weight.requires_grad_(True)), atol=1e-4, fast_mode=not LONG)
 
 
 def test_specks_beside_a_press_change_little(ring):
     """30 dark specks beside a press: area and depth stay."""
     scene = sphere_press(10.0, 1.0, height=120, width=160, mm_per_pixel=0.1)
-    from torchvts import Sensor
-
     sensor = Sensor("rig", 120, 160, 0.1)
     lights = ring(50.0, 60.0)
     pipe = DepthPipeline.from_calibration(Calibration.from_lights(lights, sensor))

@@ -13,13 +13,12 @@ import warnings
 from collections import deque
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 import torch
-from conftest import Frames, write_film
+from conftest import Frames, unit_and_camera, write_film
 
 import torchvts as vts
 from torchvts import stream as streams
@@ -28,30 +27,12 @@ from torchvts.pipeline import unit_pipeline
 from torchvts.stream.numbered import Played
 from torchvts.stream.sources import SETTLING, LiveReader, times_file
 
-ROOT = Path(__file__).resolve().parents[2]
 PITCH = 0.25
 
 
 @pytest.fixture(scope="module")
 def unit(ring, small_sensor, small_press):
-    """A calibrated unit, and a camera: press in mm and brightness to a picture (H, W, 3) B, G, R, 8 bits, with noise."""
-    lights = ring()
-    rest = vts.scenes.render(vts.scenes.undeformed(small_press()), lights)
-    rendered = {0.0: rest} | {mm: vts.scenes.render(small_press(mm), lights) for mm in (0.5, 1.0)}
-    calibration = vts.Calibration.from_lights(
-        lights, small_sensor, vts.scenes.render(vts.scenes.undeformed(small_press()), lights)[0]
-    )
-    taken = []
-
-    def camera(press_mm=0.0, brightness=1.0, noise=0.004):
-        generator = np.random.default_rng(len(taken))
-        taken.append(press_mm)
-        image = rendered[press_mm][0].permute(1, 2, 0).flip(2).numpy() * brightness
-        image = image + noise * generator.standard_normal(image.shape, dtype=np.float32)
-        return (image.clip(0, 1) * 255 + 0.5).astype(np.uint8)
-
-    camera.restart = taken.clear
-    return calibration, camera
+    return unit_and_camera(ring(), small_sensor, small_press)
 
 
 @pytest.fixture(autouse=True)
@@ -66,23 +47,6 @@ def video(unit, tmp_path_factory):
     camera.restart()
     pictures = [camera(1.0 if 15 <= k < 25 else 0.0) for k in range(35)]
     return write_film(tmp_path_factory.mktemp("video") / "press.avi", pictures)
-
-
-@pytest.mark.parametrize(
-    "name, error, message",
-    [
-        ("none.avi", FileNotFoundError, "source: .*no such file or folder"),
-        ("text.txt", ValueError, "source: .*expected a video, an image or a container"),
-        ("empty", ValueError, "source: .*no images"),
-        ("damaged.avi", ValueError, "source: .*not a video"),
-    ],
-)
-def test_bad_sources_are_named(tmp_path, name, error, message):
-    (tmp_path / "empty").mkdir()
-    (tmp_path / "text.txt").write_text("no video")
-    (tmp_path / "damaged.avi").write_bytes(b"RIFF0000AVI ")
-    with pytest.raises(error, match=message):
-        streams.open_source(tmp_path / name)
 
 
 def images(pictures):

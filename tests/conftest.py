@@ -22,7 +22,7 @@ import torch
 
 import torchvts as vts
 from lab.drawn_sensors import DrawnSensor, drawn_sensor
-from torchvts import compiled, viz
+from torchvts import compiled
 from torchvts.cli import COMMANDS, main
 from torchvts.core.files import checksum, load_tensors
 
@@ -40,7 +40,7 @@ def _coarse_surfaces():
     """Pictures draw surfaces of few points: those of a whole frame take a second each. make test-long draws them whole."""
     with pytest.MonkeyPatch.context() as patch:
         if not LONG:
-            patch.setattr(viz, "MOST_POINTS", 40)
+            patch.setattr("torchvts.viz.MOST_POINTS", 40)
         yield
 
 

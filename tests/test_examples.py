@@ -3,7 +3,7 @@
 import runpy
 
 import pytest
-from documents import ROOT
+from conftest import ROOT
 from documents import run as run_document
 
 import torchvts as vts

@@ -10,7 +10,7 @@ from types import ModuleType
 
 import pytest
 import yaml
-from documents import ROOT
+from conftest import ROOT
 from PIL import Image
 
 import torchvts as vts

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 import torch
-from documents import ROOT, blocks, run
+from conftest import ROOT
+from documents import blocks, run
 
 import torchvts as vts
 from torchvts.model.response_field import CHANGE_SCALE

@@ -5,7 +5,8 @@ import shutil
 import numpy as np
 import pytest
 import torch
-from documents import ROOT, run
+from conftest import ROOT
+from documents import run
 
 import torchvts as vts
 from torchvts import scenes

@@ -31,7 +31,7 @@ class Normals(torch.nn.Module):
 
 pipe = vts.DepthPipeline.from_calibration(calibration, normals=(network := Normals()))
 optimiser, losses = torch.optim.Adam(network.parameters(), lr=3e-2), []
-for _ in range(80):
+for _ in range(50):
     loss = (pipe(kornia.augmentation.RandomGaussianNoise(std=0.01, p=1.0)(images)).depth_mm - truth_mm).abs().mean()
     optimiser.zero_grad()
     loss.backward()

@@ -75,7 +75,9 @@ def test_a_wrong_background_is_named_with_its_place():
 
 
 def test_a_new_background_keeps_what_is_known_of_the_field():
-    """A stream takes its own: the bounds of its frames rest on the covariance."""
+    """A stream takes its own: the bounds of its frames rest on the covariance, their contact on what presses showed of it."""
     unit, _ = by_presses(UNIT.background, UNIT.sensor, bare(UNIT.balls[:3]), None)
+    unit = dataclasses.replace(unit, contact_share=0.5, contact_decay_mm=0.3)
     again = with_background(unit, UNIT.background)
     assert torch.equal(again.covariance, unit.covariance)
+    assert (again.contact_share, again.contact_decay_mm) == (0.5, 0.3)

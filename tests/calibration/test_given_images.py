@@ -9,7 +9,6 @@ from conftest import calibrated, half_drawn
 import torchvts as vts
 from torchvts.calibration.given_images import sort_presses
 from torchvts.calibration.resting import beside_presses
-from torchvts.core.views import Views
 from torchvts.model.usable import FrameCheck
 
 NUMBERS = (0, 3)
@@ -154,14 +153,6 @@ def test_one_press_with_swapped_channels_is_left_out_by_name():
         ValueError, match=r"^presses: expected the background's view of the skin in its light, got 6 of 6 that are none: ball 0"
     ):
         vts.calibrate(unit.background.flip(0), unit.sensor, [presses[k] for k in (0, 1, 3, 4, 5, 0)])
-
-
-def test_half_of_an_even_background_changed_is_no_other_view():
-    even = 0.5 + 0.01 * torch.rand(3, 96, 128, generator=torch.Generator().manual_seed(0))
-    pressed = even.clone()
-    pressed[0, :, :64] *= 1.4
-    views = Views(even.numpy())
-    assert views.other(views.cells(pressed.numpy())) is None
 
 
 @pytest.mark.parametrize("name", ["gelsight_mini_a", "digit_b"])

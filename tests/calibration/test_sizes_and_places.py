@@ -40,7 +40,7 @@ def test_right_sizes_are_not_complained_of(whole):
 @pytest.mark.parametrize("mistake", ["twice the pitch", pytest.param("radii for diameters", marks=pytest.mark.long)])
 def test_sizes_that_all_presses_contradict_are_refused_and_forced(mistake):
     unit = drawn_sensor(0)
-    sensor, presses = unit.sensor, bare(unit.balls[:4])
+    sensor, presses = unit.sensor, bare(unit.balls[:6])
     if mistake == "twice the pitch":
         sensor = dataclasses.replace(sensor, mm_per_pixel=2 * sensor.mm_per_pixel)
     else:

@@ -83,7 +83,9 @@ def test_presses_are_kept_or_refused_until_the_error_that_was_asked_for_is_state
     assert torch.allclose(background, unit.background, atol=0.6 / 255)
 
 
-def test_an_ended_session_keeps_what_there_is_and_goes_on(unit, shots, run_script, tmp_path):
+def test_an_ended_session_keeps_what_there_is_and_goes_on(unit, shots, run_script, tmp_path, monkeypatch):
+    for room in ("guide", "calibrate"):  # the test of presses above has its picture
+        monkeypatch.setattr(f"torchvts.cli.{room}.draw", lambda *given: None)
     film = film_of(tmp_path / "film.mkv", unit, shots[:1])
     taken, ended = tmp_path / "unit_presses" / "catalog.csv", threading.Event()
 

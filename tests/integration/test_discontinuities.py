@@ -181,20 +181,6 @@ def test_adaptive_integration_is_poisson_on_smooth_frames_and_robust_on_others()
     assert torch.equal(depth[1:], torch.cat([integrate(frame) for frame in frames]))
 
 
-@pytest.mark.parametrize("center_mm", [(-17.0, 4.0), (18.0, -13.0)])
-def test_contact_at_the_image_border_wants_a_free_border(center_mm, ring):
-    """From the image: the free border has at most half of the zero border's largest error (0.4 against 4 to 15 px)."""
-    scene = scenes.sphere_press(10.0, 1.0, center_mm, *SIZE, PITCH)
-    rest = scenes.render(scenes.undeformed(scene), ring(), noise_std=0.005, bits=8, seed=1)[0]
-    calibration = vts.Calibration.from_lights(ring(), vts.Sensor("rig", *SIZE, PITCH), rest)
-    image = scenes.render(scene, ring(), noise_std=0.005, bits=8)
-    free, zero = (
-        largest_px(vts.DepthPipeline.from_calibration(calibration, "precise", integrate=block(PITCH))(image).depth_mm, scene)
-        for block in (vts.PoissonBackground, vts.PoissonDST)
-    )
-    assert free < 0.5 * zero and free < 0.5
-
-
 def smooth_hill(x, y):
     """Not zero anywhere, tilted, no symmetry."""
     return 2.0 + 0.8 * torch.exp(-((x - 3) ** 2 + (y + 2) ** 2) / 30) + 0.03 * x - 0.02 * y + 0.2 * torch.sin(0.4 * x + 0.2 * y)

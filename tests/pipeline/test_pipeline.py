@@ -179,7 +179,7 @@ def dimmed(lights, factors):
 
 
 @pytest.mark.parametrize("mode, radius_mm, press_mm", [("fast", 10.0, 1.0), ("precise", 40.0, 2.0)])
-@pytest.mark.parametrize("factors", [(0.5, 0.5, 0.5), (0.6, 1.2, 0.9)])
+@pytest.mark.parametrize("factors", [(0.6, 1.2, 0.9), pytest.param((0.5, 0.5, 0.5), marks=pytest.mark.long)])
 def test_leds_that_have_dimmed_change_nothing(ring, small_sensor, small_press, factors, radius_mm, press_mm, mode):
     """Contacts of 5 and 40 % of the image."""
     lights, scene = ring(), small_press(press_mm, (2.0, 1.0), radius_mm)

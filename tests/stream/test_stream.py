@@ -134,20 +134,6 @@ def test_a_folder_gives_the_same_and_calibrates_itself(unit, small_sensor, small
         check_press(stream, small_press)
 
 
-def test_corners_are_rectified(unit, small_sensor, tmp_path):
-    calibration, camera = unit
-    corners = [(30, 20), (210, 35), (200, 150), (25, 170)]
-    target = np.float32([[0, 0], [159, 0], [159, 119], [0, 119]])
-    there = cv2.getPerspectiveTransform(target, np.float32(corners))
-    pictures = [cv2.warpPerspective(camera(1.0 if k >= 14 else 0.0), there, (240, 180)) for k in range(18)]
-    video = write_film(tmp_path / "slanted.avi", pictures)
-    sensor = replace(small_sensor, corners_px=tuple(corners))
-    background = sensor.rectify(torch.stack([frame for _, frame in vts.frames(video)])[:12]).mean(0)
-    with streams.TactileStream(video, vts.Calibration.from_lights(calibration.lights, sensor, background)) as stream:
-        areas = [float(frame.output.deformed.double().mean()) for frame in stream]
-    assert max(areas[:14]) == 0 and min(areas[14:]) > 0.05
-
-
 def test_a_given_calibration_is_held_against_the_first_frames(unit):
     calibration, camera = unit
     with pytest.raises(ValueError, match="first frames show contact"):
@@ -401,11 +387,6 @@ def test_a_network_sees_no_markers(marked, tmp_path):
     network.save(tmp_path / "network.safetensors")
     pipe = unit_pipeline(known, "fast", tmp_path / "network.safetensors")
     assert float(pipe.frame_of((known.background * dots)[None])[1].abs().max()) < 0.05  # 0.5 where dots are seen
-
-
-def test_a_zeroed_unit_keeps_what_presses_showed_of_contact(unit):
-    zeroed = streams.background.with_background(replace(unit[0], contact_share=0.5, contact_decay_mm=0.3), unit[0].background)
-    assert (zeroed.contact_share, zeroed.contact_decay_mm) == (0.5, 0.3)
 
 
 def test_first_frames_of_another_view_are_named_as_such(unit):

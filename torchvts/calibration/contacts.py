@@ -16,7 +16,7 @@ from ..core.morphology import dilate, erode
 from ..integration import PoissonBackground
 from ..model.calibration import PEDESTAL, Calibration
 from ..model.report import PressRow
-from ..model.response_field import ResponseField, ResponseModel
+from ..model.response_field import MAX_SINE, ResponseField, ResponseModel
 from ..model.sensor import Sensor
 from ..normals import NormalFromResponse
 from .presses import Press
@@ -25,8 +25,8 @@ from .regions import above_skin, contact_region
 INSIDE = 0.85
 """Share of the contact radius within which the skin lies on the ball; further out it begins to leave it."""
 
-LEAST_INSIDE = 10
-"""Sampled pixels that a contact needs inside of that radius."""
+LEAST_SAMPLES = 10
+"""Sampled pixels that a contact needs inside of that radius, and the zone around it that a fit uses."""
 
 ROUGH = 0.13
 """Structure between the channels of a background from which it is taken for a contact: :func:`channel_structure`."""
@@ -60,7 +60,6 @@ class Contact:
         half_size_mm: (2,), half the width and height of the image, mm.
         center_mm: (2,), center of the ball, as far as known.
         contact_radius_mm: radius of the contact, as far as known.
-        outline_mm: radius of the outline of the strong change; 0 where it was not searched.
         uneven: unevenness of the image's light beside the background's.
         known: the center was given and is not searched.
         radius_known: the contact radius was given and is not searched.
@@ -81,7 +80,6 @@ class Contact:
     half_size_mm: Tensor
     center_mm: Tensor = field(default_factory=lambda: torch.zeros(2, dtype=torch.float64))
     contact_radius_mm: float = 0.0
-    outline_mm: float = 0.0
     uneven: float = 0.0
     known: bool = False
     radius_known: bool = False
@@ -101,8 +99,8 @@ class Contact:
         return self.polar()[2] < INSIDE * self.contact_radius_mm
 
     def height_above_equator(self) -> Tensor:
-        """(N,) mm: height of the ball's surface above its equator; beyond 0.95 of the radius, that at 0.95."""
-        return (self.radius_mm**2 - self.polar()[2].square()).clamp_min((0.3 * self.radius_mm) ** 2).sqrt()
+        """(N,) mm: height of the ball's surface above its equator; where its sine is beyond ``MAX_SINE``, that at it."""
+        return (self.radius_mm**2 - self.polar()[2].clamp_max(MAX_SINE * self.radius_mm).square()).sqrt()
 
     def ball_slope(self) -> Tensor:
         """(2, N): slope of the ball's surface at the sampled pixels."""

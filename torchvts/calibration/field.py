@@ -24,14 +24,12 @@ from ..model.response_field import (
     slope_from_sine,
     term_values,
 )
-from .contacts import Contact
+from .contacts import LEAST_SAMPLES, Contact
 
 TRANSITION_WEIGHT = 0.3
 """Weight of the transition zone around a contact."""
 TRANSITION_REACH = 2.0
 """The transition zone between ball and undeformed skin ends at this many contact radii."""
-LEAST_ZONE = 10
-"""Sampled pixels that it needs."""
 ORDER_PENALTY = (1.0, 10.0, 30.0)
 """Prior precision of linear terms, products of two, and of three, relative to each other: products fit one unit and one place."""
 DEGREE_PENALTY = 2.0
@@ -105,7 +103,7 @@ class ContactForms:
         right = ball_sine(self.contact)[:, inside] @ terms.t() / count
         dx, dy, r = self.contact.polar()
         zone = (r > self.contact.contact_radius_mm) & (r < TRANSITION_REACH * self.contact.contact_radius_mm)
-        if (count := int(zone.sum())) >= LEAST_ZONE:
+        if (count := int(zone.sum())) >= LEAST_SAMPLES:
             around = self.terms[:, zone]
             across = torch.cat((-around * (dy / r)[zone], around * (dx / r)[zone]))
             form = form + TRANSITION_WEIGHT * across @ across.t() / count

@@ -25,8 +25,9 @@ SCREENING_PENALTY = 0.01
 PRIOR_PRESSES = 0.3
 """A prior counts as so many presses when a press is compared with the prior as the others change it, where they cover its place."""
 
-NOISE = 0.1
-"""Standard deviation of the gain of a press by the field of others that cover its place."""
+PRESS_GAIN = 0.1
+"""Standard deviation of the gain of a press by the field of others that cover its place, and of one press over its unit's: of
+single presses of two Minis and two DIGITs, 7 in 200 are beyond a factor of 1.42."""
 
 DOUBTED = 3.0
 """So many standard deviations off, a press is named."""
@@ -154,8 +155,8 @@ def _wrong_diameter(contact: Contact, gain: float, others: str) -> str:
 def _uncertainty(evidence: Evidence, prior: Prior) -> Tensor:
     """(N,): standard deviation of the gain of each press by a field of the others.
 
-    A press errs by :data:`NOISE` of its sines, alike all over it; the normal equations of the others give what that does elsewhere.
-    It is large where no other press lies near, and where little light changes: there the others say nothing.
+    A press errs by :data:`PRESS_GAIN` of its sines, alike all over it; the normal equations of the others give what that does
+    elsewhere. It is large where no other press lies near, and where little light changes: there the others say nothing.
     """
     penalty, form = torch.diag(prior.precision.repeat(2)), evidence.grams.sum(0)
     variance = []
@@ -165,11 +166,11 @@ def _uncertainty(evidence: Evidence, prior: Prior) -> Tensor:
         along = (ball @ terms.t()).reshape(-1) / ball.square().sum().clamp_min(1e-12)  # of the gain by the coefficients
         carried = along @ torch.linalg.solve(form - gram + penalty, along)
         variance.append(1.0 + ball.square().sum(0).mean() * carried)
-    return NOISE * torch.stack(variance).sqrt()
+    return PRESS_GAIN * torch.stack(variance).sqrt()
 
 
 def _usual(gains: Tensor, std: Tensor) -> float:
     """The gain of right presses, as a small field is off by one factor in the middle of all: weighted median of gains and one 1."""
     values, order = torch.cat((gains, torch.ones_like(gains[:1]))).sort()
-    weights = torch.cat(((NOISE / std).square(), torch.ones_like(std[:1])))[order]
+    weights = torch.cat(((PRESS_GAIN / std).square(), torch.ones_like(std[:1])))[order]
     return max(float(values[int((weights.cumsum(0) < 0.5 * weights.sum()).sum())]), 1e-3)

@@ -11,7 +11,7 @@ from ..core.robust import tukey_weight
 from ..model.response_field import MAX_SINE, ResponseModel
 from ..model.sensor import Sensor
 from ..normals import NormalFromResponse
-from .closure import close_loops
+from .closure import PENALTY, close_loops
 from .contacts import LEAST_SAMPLES, Contact, first_pass_depths, middle_px, used
 from .field import ContactForms, Family, solve_with_centers
 from .regions import one_ball, strong_blobs
@@ -78,7 +78,7 @@ def _locate_jointly(contacts: list[Contact], pitch_mm: float, half_mm: float) ->
         forms = [ContactForms(family, contact) for contact in contacts]
         coefficient = torch.zeros(2, family.size(), dtype=torch.float64)
         for _ in range(rounds):
-            coefficient = solve_with_centers(forms, 0.01 * family.penalty(), anchors, 0.3)
+            coefficient = solve_with_centers(forms, PENALTY * family.penalty(), anchors, 0.3)
             for item in forms:
                 update_radius(item.contact, item.slope(coefficient), pitch_mm)
 

@@ -32,7 +32,7 @@ MOST_CUT = 0.5
 """Share of the presses that may be without a net slope: cut by the image border, or saturated."""
 
 PENALTY = 0.01
-"""Regularisation of the fields, in presses."""
+"""Regularisation of the fields by which balls are located and compared where there is no prior, in presses."""
 
 
 def close_loops(contacts: list[Contact], half_mm: float) -> None:

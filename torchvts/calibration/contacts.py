@@ -19,6 +19,7 @@ from ..model.report import PressRow
 from ..model.response_field import MAX_SINE, ResponseField, ResponseModel
 from ..model.sensor import Sensor
 from ..normals import NormalFromResponse
+from ..normals.shadowed import UNCHANGED_NOISES
 from .presses import Press
 from .regions import above_skin, contact_region
 
@@ -30,9 +31,6 @@ LEAST_SAMPLES = 10
 
 ROUGH = 0.13
 """Structure between the channels of a background from which it is taken for a contact: :func:`channel_structure`."""
-
-DIFFERS = 4.5
-"""Change in units of the noise from which an image differs."""
 
 LIGHT_DRIFT = 0.008
 """Least noise by which a press differs from the background, relative to it: the LEDs of real sensors drift by 1 to 2 %."""
@@ -160,7 +158,7 @@ def differing(change: Tensor, noise_std: Tensor) -> Tensor:
         change: (3, H, W).
         noise_std: its noise, (3, H, W), or what broadcasts to it.
     """
-    strong = (change / noise_std).square().sum(0) > DIFFERS**2
+    strong = (change / noise_std).square().sum(0) > UNCHANGED_NOISES**2
     closed = erode(dilate(strong[None, None]))  # pixels lost to noise
     return dilate(erode(closed, 2), 2)[0, 0]
 

@@ -36,8 +36,6 @@ DEGREE_PENALTY = 2.0
 """Each degree in position multiplies it: slowly varying fields are likely."""
 CORE = 0.5
 """Share of the contact radius within which slopes are compared with those of a ball of another size."""
-LEAST_POWER = 1e-3
-"""Least mean square of the changes, so that a field of nothing stays determined."""
 
 
 @dataclass(frozen=True)
@@ -164,7 +162,7 @@ def power_of(contacts: Sequence[Contact]) -> float:
     """
     changes = [contact.change.flatten(1)[:, contact.index[contact.inside()]] for contact in contacts]
     squares = [float(change.square().sum(0).mean()) for change in changes if change.shape[1] > 0]
-    return max(sum(squares) / max(1, len(squares)) / CHANGE_SCALE**2, LEAST_POWER)
+    return sum(squares) / max(1, len(squares)) / CHANGE_SCALE**2 or 1.0  # so that a field of nothing stays determined
 
 
 def ball_sine(contact: Contact) -> Tensor:

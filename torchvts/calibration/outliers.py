@@ -15,12 +15,10 @@ from ..model.response_field import SensorPrior
 from ..model.sensor import Sensor
 from ..model.stated_error import stated_deg
 from .balls import locate
+from .closure import PENALTY
 from .contacts import Contact, used
 from .field import Family, ball_sine, power_of
 from .posterior import Evidence, Prior, weights_of
-
-SCREENING_PENALTY = 0.01
-"""Regularisation of the small fields by which presses without a prior are compared with each other."""
 
 PRIOR_PRESSES = 0.3
 """A prior counts as so many presses when a press is compared with the prior as the others change it, where they cover its place."""
@@ -95,7 +93,7 @@ def _weigh(contacts: list[Contact], prior: SensorPrior | None, half_mm: float) -
         contact.weight, contact.doubt = 1.0, ""
     evidence = Evidence(family, left)
     if prior is None:
-        start = Prior(torch.zeros(2, family.size(), dtype=torch.float64), SCREENING_PENALTY * family.penalty())
+        start = Prior(torch.zeros(2, family.size(), dtype=torch.float64), PENALTY * family.penalty())
     else:
         start = Prior(prior.response.field.tensor(), PRIOR_PRESSES * family.penalty(power_of(left)))
     found = _in_turn(evidence, start)

@@ -21,7 +21,7 @@ from ..model.sensor import Sensor
 from ..normals import NormalFromResponse
 from ..normals.shadowed import UNCHANGED_NOISES
 from .presses import Press
-from .regions import above_skin, contact_region
+from .regions import LIGHT_DRIFT, above_skin, contact_region
 
 INSIDE = 0.85
 """Share of the contact radius within which the skin lies on the ball; further out it begins to leave it."""
@@ -31,9 +31,6 @@ LEAST_SAMPLES = 10
 
 ROUGH = 0.13
 """Structure between the channels of a background from which it is taken for a contact: :func:`channel_structure`."""
-
-LIGHT_DRIFT = 0.008
-"""Least noise by which a press differs from the background, relative to it: the LEDs of real sensors drift by 1 to 2 %."""
 
 OTHER_SKIN = 0.1
 """Change of the least changed skin, relative, from which an image is that of another unit."""

@@ -11,8 +11,8 @@ from ..core.levels import DARK, DARKEST, MOST_SATURATED, SATURATED, bits_of
 from ..model.calibration import PEDESTAL
 from ..model.usable import FrameCheck
 from ..normals.shadowed import UNCHANGED_NOISES
-from .contacts import LIGHT_DRIFT
 from .presses import Press
+from .regions import LIGHT_DRIFT
 
 UNIFORM_COLOUR = 0.05
 """Variation of a background's colour, RMS of the differences of log R, G and B, below which no coloured lights are seen."""

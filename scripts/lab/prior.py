@@ -12,9 +12,9 @@ from torchvts.calibration import CalibrationWarning, Press, by_presses
 from torchvts.calibration.contacts import Contact, used
 from torchvts.calibration.field import ContactForms, Family, power_of
 from torchvts.calibration.given_images import sort_presses
-from torchvts.calibration.posterior import Evidence, Prior
+from torchvts.calibration.posterior import FEW, Evidence, Prior
 from torchvts.calibration.presses import check_presses
-from torchvts.calibration.response_fit import FEW, fit_depth_brightness
+from torchvts.calibration.response_fit import fit_depth_brightness
 from torchvts.core.checks import check_image
 from torchvts.model.calibration import Calibration
 from torchvts.model.response_field import ResponseField, ResponseModel, SensorPrior, image_basis

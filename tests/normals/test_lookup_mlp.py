@@ -11,11 +11,11 @@ import torchvts as vts
 from lab.metrics import normal_angle_deg
 from lab.score import ball_truth
 from torchvts.core.files import save_tensors
-from torchvts.core.geometry import gradient_from_normal, normal_from_gradient
+from torchvts.core.geometry import MAX_SLOPE, gradient_from_normal, normal_from_gradient
 from torchvts.model.gs_sdk import read_calibration_folder, read_labels
 from torchvts.model.response_field import ResponseField, ResponseModel
 from torchvts.normals.lookup import NormalFromLookup
-from torchvts.normals.mlp import MAX_GRADIENT, NormalFromMLP
+from torchvts.normals.mlp import NormalFromMLP
 from torchvts.training import fit_mlp
 
 HEIGHT, WIDTH = 24, 32
@@ -227,9 +227,9 @@ def test_no_output_is_steeper_than_the_bound(output, level, tmp_path):
     torch.save(state, tmp_path / "steep.pth")
     block = NormalFromMLP.load(tmp_path / "steep.pth", torch.zeros(3, HEIGHT, WIDTH), output=output)
     gradient = block.gradient_px(torch.full((1, 3, HEIGHT, WIDTH), 1.0))
-    expected = min(MAX_GRADIENT, math.tan(level) if output == "angle" and level < math.radians(84) else MAX_GRADIENT)
+    expected = min(MAX_SLOPE, math.tan(level) if output == "angle" and level < math.atan(MAX_SLOPE) else MAX_SLOPE)
     if output == "gradient":
-        expected = min(level, MAX_GRADIENT)
+        expected = min(level, MAX_SLOPE)
     assert float(gradient[:, 0].max()) == pytest.approx(expected, rel=1e-4)
 
 

@@ -1,7 +1,6 @@
 """Locate the ball in each press: by its outline, by slopes that are known, or jointly with response fields of rising size."""
 
 import dataclasses
-import math
 
 import numpy as np
 import torch
@@ -9,28 +8,16 @@ from torch import Tensor
 
 from ..core.geometry import gradient_from_normal
 from ..core.robust import tukey_weight
-from ..model.response_field import ResponseModel
+from ..model.response_field import MAX_SINE, ResponseModel
 from ..model.sensor import Sensor
 from ..normals import NormalFromResponse
-from .closure import close_loops
-from .contacts import LEAST_INSIDE, Contact, first_pass_depths, middle_px, used
+from .closure import PENALTY, close_loops
+from .contacts import LEAST_SAMPLES, Contact, first_pass_depths, middle_px, used
 from .field import ContactForms, Family, solve_with_centers
 from .regions import one_ball, strong_blobs
 
 EDGE_SLOPE_RATIO = 0.6
 """The contact ends where the skin's slope has fallen to this part of the ball's: about the middle of the fall."""
-
-WIDEST = 0.95
-"""Largest contact radius that is searched, in radii of the ball: at 0.95 its slope is 3."""
-
-LABEL_PX = 1.5
-"""Standard deviation of a label, pixels: those of five real sensors are good to 1 to 2."""
-
-OUTLINE = 0.15
-"""The same of the center of an outline, in its radii: 5 px on a GelSight Mini and a pale GelSight."""
-
-FAR_LABEL = 4.0
-"""A label so many standard deviations from the outline's center is wrong."""
 
 JOINT_STAGES = ((0, -1, 3), (1, -1, 3), (2, -1, 6), (3, 2, 4))
 """Families and rounds in which balls are located jointly. Linear fields come first: with products the field can imitate a shift of
@@ -65,18 +52,18 @@ def locate(contacts: list[Contact], sensor: Sensor, prior: ResponseModel | None,
         _locate_jointly(usable, pitch_mm, half_mm)
         close_loops(usable, half_mm)
     for contact in usable:
-        if not contact.reason and int(contact.inside().sum()) < LEAST_INSIDE:
+        if not contact.reason and int(contact.inside().sum()) < LEAST_SAMPLES:
             contact.reason = "no ball of this diameter fits the contact"
 
 
 def wrong_label(contact: Contact, sensor: Sensor) -> str:
-    """That a label lies further from the outline of the contact than both can err, or that nothing is seen there; or ""."""
+    """That a label lies outside of the contact that its outline shows, or that nothing is seen there; or ""."""
     outline = dataclasses.replace(contact)
     guess_circle(outline, sensor)
     off_mm = float((contact.center_mm - outline.center_mm).norm())
-    if not outline.reason and off_mm > FAR_LABEL * math.hypot(LABEL_PX * sensor.mm_per_pixel, OUTLINE * outline.outline_mm):
+    if not outline.reason and off_mm > outline.contact_radius_mm:
         return f"label is {off_mm / sensor.mm_per_pixel:.0f} px from the contact: correct it, or leave it out"
-    if int(contact.inside().sum()) < LEAST_INSIDE:
+    if int(contact.inside().sum()) < LEAST_SAMPLES:
         return "no contact is seen at the given center and contact radius: a mistake in the label?"
     return ""
 
@@ -91,7 +78,7 @@ def _locate_jointly(contacts: list[Contact], pitch_mm: float, half_mm: float) ->
         forms = [ContactForms(family, contact) for contact in contacts]
         coefficient = torch.zeros(2, family.size(), dtype=torch.float64)
         for _ in range(rounds):
-            coefficient = solve_with_centers(forms, 0.01 * family.penalty(), anchors, 0.3)
+            coefficient = solve_with_centers(forms, PENALTY * family.penalty(), anchors, 0.3)
             for item in forms:
                 update_radius(item.contact, item.slope(coefficient), pitch_mm)
 
@@ -142,8 +129,7 @@ def guess_circle(contact: Contact, sensor: Sensor) -> None:
     center_px, radius_px = _circle(outline[free])
     contact.center_mm = (center_px - middle_px(sensor)) * sensor.mm_per_pixel
     # the outline lies outside of the contact, by about a fifth of its radius
-    contact.outline_mm = radius_px * sensor.mm_per_pixel
-    contact.contact_radius_mm = min(0.8 * contact.outline_mm, WIDEST * contact.radius_mm)
+    contact.contact_radius_mm = min(0.8 * radius_px * sensor.mm_per_pixel, MAX_SINE * contact.radius_mm)
 
 
 def _circle(points: Tensor) -> tuple[Tensor, float]:
@@ -170,7 +156,7 @@ def update_radius(contact: Contact, slope: Tensor, pitch_mm: float, damping: flo
         return
     dx, dy, r = contact.polar()
     ring = (r / pitch_mm).round().long()
-    count = int(0.95 * contact.radius_mm / pitch_mm)
+    count = int(MAX_SINE * contact.radius_mm / pitch_mm)
     near = (ring < count) & (ring > 0) & ~contact.saturated
     outward = torch.stack((dx, dy)) / r.clamp_min(1e-9)
     measured, ball = -(slope * outward).sum(0), -(contact.ball_slope() * outward).sum(0)
@@ -181,7 +167,7 @@ def update_radius(contact: Contact, slope: Tensor, pitch_mm: float, damping: flo
     for k in range(start, count - 1):
         if ratio[k] >= EDGE_SLOPE_RATIO > ratio[k + 1]:
             found = (k + float((ratio[k] - EDGE_SLOPE_RATIO) / (ratio[k] - ratio[k + 1]))) * pitch_mm
-            contact.contact_radius_mm += (1.0 - damping) * (min(found, WIDEST * contact.radius_mm) - contact.contact_radius_mm)
+            contact.contact_radius_mm += (1.0 - damping) * (min(found, MAX_SINE * contact.radius_mm) - contact.contact_radius_mm)
             return
 
 
@@ -191,7 +177,7 @@ def center_by_slope(contact: Contact, slope_map: Tensor, pitch_mm: float, rounds
     limit = 0.25 * contact.radius_mm
     for _ in range(rounds):
         inside = contact.inside()
-        if int(inside.sum()) < LEAST_INSIDE:
+        if int(inside.sum()) < LEAST_SAMPLES:
             contact.reason = (
                 f"no ball of {2 * contact.radius_mm:g} mm fits the contact: wrong diameter, too faint a press, or not round"
             )

@@ -12,17 +12,10 @@ from ..model.report import Report
 from ..model.response_field import CHANGE_SCALE, ResponseField, ResponseModel
 from ..model.sensor import Sensor
 from .given_images import colourless
-from .lights import POORLY_CONSTRAINED_DEG, LightFit, fit_lights
+from .lights import NOTHING_LEFT, POORLY_CONSTRAINED_DEG, LightFit, fit_lights
 
 GIVEN_MISFIT = 0.2
 """RMS of log(background / image of the sensor file's lights) from which they are not the unit's: only their directions are used."""
-
-NOTHING_LEFT = 0.005
-"""Misfit from which another gamma is tried where the sensor file leaves it open, and from which depth is not metric."""
-
-WELL_CONSTRAINED_DEG = 2.0
-MOST_MISFIT = 0.02
-"""Lights that are less certain, or leave more of the background, do not show that there are coloured lights at all."""
 
 OTHER_GAMMA = 2.2
 """Of most cameras. Lights fitted to its images as if they were linear are 11 degrees off, and leave a misfit of 3 %."""
@@ -54,8 +47,8 @@ def by_lights(background: Tensor, sensor: Sensor, progress: bool = False) -> tup
             f"background: {fit.message}; nothing else is there to calibrate from: give presses of balls, or a sensor with a prior"
         )
     loosest, misfit = float(fit.direction_std_deg.max()), float(fit.misfit.max())
-    sure = fit.converged and loosest <= WELL_CONSTRAINED_DEG and misfit < MOST_MISFIT
-    if not sure and (no_colour := colourless(background)):
+    sure = fit.converged and loosest <= POORLY_CONSTRAINED_DEG
+    if not (sure and misfit <= NOTHING_LEFT) and (no_colour := colourless(background)):
         raise ValueError(no_colour)
     constrained = f"one image constrains the lights to {loosest:.2f} deg, with a smooth misfit of {misfit:.1%}"
     report: Report = {
@@ -66,7 +59,7 @@ def by_lights(background: Tensor, sensor: Sensor, progress: bool = False) -> tup
         "direction_std_deg": fit.direction_std_deg.tolist(),
         "misfit": fit.misfit.tolist(),
     }
-    doubts = [] if fit.converged and loosest <= POORLY_CONSTRAINED_DEG else [f"background: {fit.message}"]
+    doubts = [] if sure else [f"background: {fit.message}"]
     return Calibration.from_lights(fit.lights, linear, background, report), doubts
 
 

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from .contacts import Contact
 from .field import Family
-from .posterior import Evidence, Prior
+from .posterior import FEW, Evidence, Prior
 
 REACH = 1.5
 """Radius of the disc, in contact radii."""
@@ -25,9 +25,6 @@ CLOSURE_ROUNDS = 3
 LEFT = 0.75
 """Net slope that may be left after the shift, as a part of that before, in the mean over the two largest families."""
 
-ENOUGH = 3
-"""Presses from which centers can be scored by holding presses out."""
-
 MOST_SATURATED = 0.05
 """Saturated part of the disc from which its net slope says nothing."""
 
@@ -35,7 +32,7 @@ MOST_CUT = 0.5
 """Share of the presses that may be without a net slope: cut by the image border, or saturated."""
 
 PENALTY = 0.01
-"""Regularisation of the fields, in presses."""
+"""Regularisation of the fields by which balls are located and compared where there is no prior, in presses."""
 
 
 def close_loops(contacts: list[Contact], half_mm: float) -> None:
@@ -48,7 +45,7 @@ def close_loops(contacts: list[Contact], half_mm: float) -> None:
         contacts: of presses with located balls.
         half_mm: scale of positions, mm.
     """
-    if len(contacts) < ENOUGH or all(contact.known for contact in contacts):
+    if len(contacts) < FEW or all(contact.known for contact in contacts):
         return
     degrees = ((1, -1), (2, -1), (2, 1)) if len(contacts) >= 5 else ((0, -1), (1, -1))
     before = [_Rating(Family(degree, products, half_mm), contacts) for degree, products in degrees]

@@ -16,26 +16,21 @@ from ..core.morphology import dilate, erode
 from ..integration import PoissonBackground
 from ..model.calibration import PEDESTAL, Calibration
 from ..model.report import PressRow
-from ..model.response_field import ResponseField, ResponseModel
+from ..model.response_field import MAX_SINE, ResponseField, ResponseModel
 from ..model.sensor import Sensor
 from ..normals import NormalFromResponse
+from ..normals.shadowed import UNCHANGED_NOISES
 from .presses import Press
-from .regions import above_skin, contact_region
+from .regions import LIGHT_DRIFT, above_skin, contact_region
 
 INSIDE = 0.85
 """Share of the contact radius within which the skin lies on the ball; further out it begins to leave it."""
 
-LEAST_INSIDE = 10
-"""Sampled pixels that a contact needs inside of that radius."""
+LEAST_SAMPLES = 10
+"""Sampled pixels that a contact needs inside of that radius, and the zone around it that a fit uses."""
 
 ROUGH = 0.13
 """Structure between the channels of a background from which it is taken for a contact: :func:`channel_structure`."""
-
-DIFFERS = 4.5
-"""Change in units of the noise from which an image differs."""
-
-LIGHT_DRIFT = 0.008
-"""Least noise by which a press differs from the background, relative to it: the LEDs of real sensors drift by 1 to 2 %."""
 
 OTHER_SKIN = 0.1
 """Change of the least changed skin, relative, from which an image is that of another unit."""
@@ -60,7 +55,6 @@ class Contact:
         half_size_mm: (2,), half the width and height of the image, mm.
         center_mm: (2,), center of the ball, as far as known.
         contact_radius_mm: radius of the contact, as far as known.
-        outline_mm: radius of the outline of the strong change; 0 where it was not searched.
         uneven: unevenness of the image's light beside the background's.
         known: the center was given and is not searched.
         radius_known: the contact radius was given and is not searched.
@@ -81,7 +75,6 @@ class Contact:
     half_size_mm: Tensor
     center_mm: Tensor = field(default_factory=lambda: torch.zeros(2, dtype=torch.float64))
     contact_radius_mm: float = 0.0
-    outline_mm: float = 0.0
     uneven: float = 0.0
     known: bool = False
     radius_known: bool = False
@@ -101,8 +94,8 @@ class Contact:
         return self.polar()[2] < INSIDE * self.contact_radius_mm
 
     def height_above_equator(self) -> Tensor:
-        """(N,) mm: height of the ball's surface above its equator; beyond 0.95 of the radius, that at 0.95."""
-        return (self.radius_mm**2 - self.polar()[2].square()).clamp_min((0.3 * self.radius_mm) ** 2).sqrt()
+        """(N,) mm: height of the ball's surface above its equator; where its sine is beyond ``MAX_SINE``, that at it."""
+        return (self.radius_mm**2 - self.polar()[2].clamp_max(MAX_SINE * self.radius_mm).square()).sqrt()
 
     def ball_slope(self) -> Tensor:
         """(2, N): slope of the ball's surface at the sampled pixels."""
@@ -162,7 +155,7 @@ def differing(change: Tensor, noise_std: Tensor) -> Tensor:
         change: (3, H, W).
         noise_std: its noise, (3, H, W), or what broadcasts to it.
     """
-    strong = (change / noise_std).square().sum(0) > DIFFERS**2
+    strong = (change / noise_std).square().sum(0) > UNCHANGED_NOISES**2
     closed = erode(dilate(strong[None, None]))  # pixels lost to noise
     return dilate(erode(closed, 2), 2)[0, 0]
 

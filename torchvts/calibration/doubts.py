@@ -16,9 +16,10 @@ from ..model.calibration import Calibration
 from ..model.report import NOT_CHECKED
 from ..model.response_field import ResponseField
 from ..model.sensor import Sensor
-from .by_lights import NOTHING_LEFT
 from .contacts import Contact, differing, used
 from .field import Family, seen_slopes
+from .lights import NOTHING_LEFT
+from .outliers import PRESS_GAIN
 
 SURE = 2.5
 """Standard deviations from which a doubt is raised: one in 80 of right sets, if they are Gaussian."""
@@ -26,14 +27,8 @@ SURE = 2.5
 UNIT_GAIN = 0.15
 """Standard deviation of the logarithm of a unit's slopes by the prior of its type over the true ones."""
 
-PRESS_GAIN = 0.1
-"""The same of one press over the unit's: of single presses of two Minis and two DIGITs, 7 in 200 are beyond a factor of 1.42."""
-
 WIDTH_ERROR = 0.05
 """Standard deviation of the width of a contact, in radii of the ball, that all presses of a set share: where its rim is seen."""
-
-WRONG_BALL = 0.5
-"""Part by which the diameter of one ball is wrong that the others should show: a radius for a diameter."""
 
 MOST_DOUBTED = 1 / 3
 """Share of presses that may each contradict all others: more of them contradict each other."""
@@ -247,12 +242,12 @@ def not_checked(contacts: Sequence[Contact], sensor: Sensor, width: Width, depth
     most = f"{sensor.mm_per_pixel / width.times:.3g}" if width.times else ""
     limit = f" (an mm_per_pixel up to {most} would fit the contacts)" if most else ""
     seen = f"{deep}: is that so? Without" if deep else ": without"
-    alone = [contact.name for contact in used(contacts) if SURE * contact.metrics.get("gain_std", math.inf) > WRONG_BALL]
+    alone = [contact.name for contact in used(contacts) if SURE * contact.metrics.get("gain_std", math.inf) > math.log(2.0)]
     named = ", ".join(alone[:3]) + (f" and {len(alone) - 3} more" if len(alone) > 3 else "")
     return Doubt(
         f"{NOT_CHECKED}: the scale rests on the diameters and the mm_per_pixel that were given{seen} a prior no "
         f"image shows whether they are right{limit}; press an object of known height to check them"
-        + (f"; a diameter wrong by half would not show in {named}: press the same ball beside it" if alone else "")
+        + (f"; a radius for a diameter would not show in {named}: press the same ball beside it" if alone else "")
     )
 
 

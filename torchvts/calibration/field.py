@@ -24,22 +24,18 @@ from ..model.response_field import (
     slope_from_sine,
     term_values,
 )
-from .contacts import Contact
+from .contacts import LEAST_SAMPLES, Contact
 
 TRANSITION_WEIGHT = 0.3
 """Weight of the transition zone around a contact."""
 TRANSITION_REACH = 2.0
 """The transition zone between ball and undeformed skin ends at this many contact radii."""
-LEAST_ZONE = 10
-"""Sampled pixels that it needs."""
 ORDER_PENALTY = (1.0, 10.0, 30.0)
 """Prior precision of linear terms, products of two, and of three, relative to each other: products fit one unit and one place."""
 DEGREE_PENALTY = 2.0
 """Each degree in position multiplies it: slowly varying fields are likely."""
 CORE = 0.5
 """Share of the contact radius within which slopes are compared with those of a ball of another size."""
-LEAST_POWER = 1e-3
-"""Least mean square of the changes, so that a field of nothing stays determined."""
 
 
 @dataclass(frozen=True)
@@ -105,7 +101,7 @@ class ContactForms:
         right = ball_sine(self.contact)[:, inside] @ terms.t() / count
         dx, dy, r = self.contact.polar()
         zone = (r > self.contact.contact_radius_mm) & (r < TRANSITION_REACH * self.contact.contact_radius_mm)
-        if (count := int(zone.sum())) >= LEAST_ZONE:
+        if (count := int(zone.sum())) >= LEAST_SAMPLES:
             around = self.terms[:, zone]
             across = torch.cat((-around * (dy / r)[zone], around * (dx / r)[zone]))
             form = form + TRANSITION_WEIGHT * across @ across.t() / count
@@ -166,7 +162,7 @@ def power_of(contacts: Sequence[Contact]) -> float:
     """
     changes = [contact.change.flatten(1)[:, contact.index[contact.inside()]] for contact in contacts]
     squares = [float(change.square().sum(0).mean()) for change in changes if change.shape[1] > 0]
-    return max(sum(squares) / max(1, len(squares)) / CHANGE_SCALE**2, LEAST_POWER)
+    return sum(squares) / max(1, len(squares)) / CHANGE_SCALE**2 or 1.0  # so that a field of nothing stays determined
 
 
 def ball_sine(contact: Contact) -> Tensor:

@@ -10,16 +10,15 @@ from ..core.arrays import array_of
 from ..core.levels import DARK, DARKEST, MOST_SATURATED, SATURATED, bits_of
 from ..model.calibration import PEDESTAL
 from ..model.usable import FrameCheck
+from ..normals.shadowed import UNCHANGED_NOISES
 from .presses import Press
+from .regions import LIGHT_DRIFT
 
 UNIFORM_COLOUR = 0.05
 """Variation of a background's colour, RMS of the differences of log R, G and B, below which no coloured lights are seen."""
 
 ACHROMATIC = 0.25
 """Share of a contact's change of light that is a change of colour, below which the lights have no colours."""
-
-FAINT = 0.03
-"""Change of the logarithm of the light from which a contact is seen at all."""
 
 OTHER_UNIT = 0.12
 """Difference from the background, median over the skin and over the presses, logarithm of the image value, from which presses
@@ -109,7 +108,7 @@ def colour_share(image: Tensor, background: Tensor) -> float | None:
     change = _cells(image, 120) - _cells(background, 120)
     change = change - change.flatten(1).median(dim=1).values[:, None, None]
     length = change.square().sum(dim=0).sqrt()
-    if float(length.max()) < FAINT:
+    if float(length.max()) < UNCHANGED_NOISES * LIGHT_DRIFT:
         return None
     contact = change[:, length > 0.4 * length.max()]
     colour = torch.stack((contact[0] - contact[1], contact[2] - contact[1]))

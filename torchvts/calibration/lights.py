@@ -24,17 +24,12 @@ from .light_uncertainty import Linearisation, covariance_and_misfit, direction_a
 COARSE_PIXELS = 8000
 """The first loop runs on this many pixels, the second on all."""
 
-GLOSS_MISFIT = 0.01
-"""A glossy skin is accepted only if it leaves less relative structure than this."""
-
-NOT_GLOSS = 0.1
-"""A matt skin that leaves more relative structure than this is not tried as a glossy one: no gloss of this lobe width helps."""
+NOTHING_LEFT = 0.005
+"""Misfit, relative to the light, up to which lights explain an image. A gloss must leave less; with more, another gamma is tried
+where the sensor file leaves it open, and depth is not metric."""
 
 GLOSSY_STEPS = 4
 """A glossy skin gets so many times the steps: its loop ends after 70 to 450, in a field of 19 mm with a gloss of 0.3 after 800."""
-
-HELD_STEPS = 10
-"""Steps with a light at the bound after which it will not come back."""
 
 LEAST_USABLE = 0.02
 """Share of each channel's pixels that a fit needs."""
@@ -46,7 +41,8 @@ STEP_TOLERANCE_MM = 1e-4
 """The loop ends after three steps that move no light further than this."""
 
 POORLY_CONSTRAINED_DEG = 5.0
-"""A light whose direction has a larger standard deviation than this is reported as poorly constrained by the image."""
+"""A light whose direction has a larger standard deviation than this is reported as poorly constrained by the image. Such lights
+do not show that there are coloured lights at all."""
 
 
 @dataclass(frozen=True)
@@ -123,7 +119,7 @@ def fit_lights(
     loop = _Loop(max_steps, progress)
     pixels = BackgroundPixels.of(background.detach().to(torch.float64).cpu(), sensor)
     best = _solve_coarse_to_fine(pixels, paraboloid_start(pixels) if start is None else from_lights(start), loop)
-    if gloss and best.converged and bool((best.misfit > 0).all()) and float(best.misfit.max()) < NOT_GLOSS:
+    if gloss and best.converged and bool((best.misfit > 0).all()):
         best = _try_gloss(pixels, best, loop._replace(max_steps=GLOSSY_STEPS * loop.max_steps)) or best
     return _light_fit(background.dtype, pixels, best, max_steps)
 
@@ -181,30 +177,30 @@ def _try_gloss(pixels: BackgroundPixels, matt: _Solution, loop: _Loop) -> _Solut
 
 def _explains(glossy: _Solution, matt: _Solution, part: float = 0.5) -> bool:
     """Whether a lobe leaves at most that part of the matt skin's misfit, and next to nothing, in every channel."""
-    less = (glossy.misfit <= part * matt.misfit) & (glossy.misfit < GLOSS_MISFIT)
+    less = (glossy.misfit <= part * matt.misfit) & (glossy.misfit < NOTHING_LEFT)
     return glossy.converged and bool((less & (glossy.parameter[:, -1] > 0)).all())
 
 
 def _solve(pixels: BackgroundPixels, start: Tensor, loop: _Loop) -> _Solution:
-    """Levenberg-Marquardt steps with robust weights renewed at each, until the lights stop moving."""
+    """Levenberg-Marquardt steps with robust weights renewed at each, until the lights stop moving or stay at their bound."""
     parameter = start.clone().requires_grad_()
     optimiser = LevenbergMarquardt(parameter)
     history: list[float] = []
-    still, held, moved, span = 0, 0, math.inf, pixels.span_mm()
+    still, moved, span = 0, math.inf, pixels.span_mm()
     most = loop.max_steps if float(pixels.usable.double().mean(dim=1).min()) >= LEAST_USABLE else 0
     with tqdm(total=loop.max_steps, desc=f"lights, {len(pixels.x)} pixels", disable=not loop.progress or None, leave=False) as bar:
-        while len(history) < most and still < 3 and held < HELD_STEPS:
+        while len(history) < most and still < 3:
             weight, scale = _robust_weight(pixels.residual(parameter.detach()), pixels.usable)
             before = parameter.detach().clone()
             optimiser.step(pixels.residual, pixels.linearised, weight)
-            held = held + 1 if bool(at_bound(parameter.detach(), span).any()) else 0
+            held = bool(at_bound(parameter.detach(), span).any())
             if held:
                 with torch.no_grad():
                     parameter.copy_(bounded(parameter, span))
                 optimiser.last_step = parameter.detach() - before
             history.append(float(_tukey_loss(pixels.residual(parameter.detach()), scale)))
             moved = _moved_mm(optimiser.last_step, parameter.detach())
-            still = still + 1 if moved < STEP_TOLERANCE_MM else 0
+            still = still + 1 if held or moved < STEP_TOLERANCE_MM else 0
             bar.update()
             bar.set_postfix(loss=f"{history[-1]:.4g}")
     parameter = parameter.detach()

@@ -15,18 +15,17 @@ from ..model.response_field import SensorPrior
 from ..model.sensor import Sensor
 from ..model.stated_error import stated_deg
 from .balls import locate
+from .closure import PENALTY
 from .contacts import Contact, used
 from .field import Family, ball_sine, power_of
 from .posterior import Evidence, Prior, weights_of
 
-SCREENING_PENALTY = 0.01
-"""Regularisation of the small fields by which presses without a prior are compared with each other."""
-
 PRIOR_PRESSES = 0.3
 """A prior counts as so many presses when a press is compared with the prior as the others change it, where they cover its place."""
 
-NOISE = 0.1
-"""Standard deviation of the gain of a press by the field of others that cover its place."""
+PRESS_GAIN = 0.1
+"""Standard deviation of the gain of a press by the field of others that cover its place, and of one press over its unit's: of
+single presses of two Minis and two DIGITs, 7 in 200 are beyond a factor of 1.42."""
 
 DOUBTED = 3.0
 """So many standard deviations off, a press is named."""
@@ -94,7 +93,7 @@ def _weigh(contacts: list[Contact], prior: SensorPrior | None, half_mm: float) -
         contact.weight, contact.doubt = 1.0, ""
     evidence = Evidence(family, left)
     if prior is None:
-        start = Prior(torch.zeros(2, family.size(), dtype=torch.float64), SCREENING_PENALTY * family.penalty())
+        start = Prior(torch.zeros(2, family.size(), dtype=torch.float64), PENALTY * family.penalty())
     else:
         start = Prior(prior.response.field.tensor(), PRIOR_PRESSES * family.penalty(power_of(left)))
     found = _in_turn(evidence, start)
@@ -154,8 +153,8 @@ def _wrong_diameter(contact: Contact, gain: float, others: str) -> str:
 def _uncertainty(evidence: Evidence, prior: Prior) -> Tensor:
     """(N,): standard deviation of the gain of each press by a field of the others.
 
-    A press errs by :data:`NOISE` of its sines, alike all over it; the normal equations of the others give what that does elsewhere.
-    It is large where no other press lies near, and where little light changes: there the others say nothing.
+    A press errs by :data:`PRESS_GAIN` of its sines, alike all over it; the normal equations of the others give what that does
+    elsewhere. It is large where no other press lies near, and where little light changes: there the others say nothing.
     """
     penalty, form = torch.diag(prior.precision.repeat(2)), evidence.grams.sum(0)
     variance = []
@@ -165,11 +164,11 @@ def _uncertainty(evidence: Evidence, prior: Prior) -> Tensor:
         along = (ball @ terms.t()).reshape(-1) / ball.square().sum().clamp_min(1e-12)  # of the gain by the coefficients
         carried = along @ torch.linalg.solve(form - gram + penalty, along)
         variance.append(1.0 + ball.square().sum(0).mean() * carried)
-    return NOISE * torch.stack(variance).sqrt()
+    return PRESS_GAIN * torch.stack(variance).sqrt()
 
 
 def _usual(gains: Tensor, std: Tensor) -> float:
     """The gain of right presses, as a small field is off by one factor in the middle of all: weighted median of gains and one 1."""
     values, order = torch.cat((gains, torch.ones_like(gains[:1]))).sort()
-    weights = torch.cat(((NOISE / std).square(), torch.ones_like(std[:1])))[order]
+    weights = torch.cat(((PRESS_GAIN / std).square(), torch.ones_like(std[:1])))[order]
     return max(float(values[int((weights.cumsum(0) < 0.5 * weights.sum()).sum())]), 1e-3)

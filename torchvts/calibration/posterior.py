@@ -33,6 +33,9 @@ from .field import ContactForms, Family, power_of
 LARGEST = (4, 3, 1)
 """Degrees in position of linear terms, products of two, and of three."""
 
+FEW = 3
+"""Presses from which a field is judged by each of them by the others."""
+
 ALL_SENSORS = 0.015
 """Prior precision of a constant linear term over all sensors, in presses."""
 

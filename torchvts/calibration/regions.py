@@ -11,8 +11,8 @@ from ..skin.weight import spread_of
 FLOOR = 5.0
 """Threshold of a contact, in standard deviations of the undeformed skin's change."""
 
-LEAST_SPREAD = 0.003
-"""Least spread, relative to the background: rounding to 8 bits."""
+LIGHT_DRIFT = 0.008
+"""Least noise and spread by which a press differs from the background, relative: the LEDs of real sensors drift by 1 to 2 %."""
 
 SECOND = 0.3
 """A blob with so much of the largest blob's change may be a second contact."""
@@ -29,7 +29,7 @@ def above_skin(change: Tensor) -> tuple[Tensor, float]:
     """
     smooth = torch.nn.functional.avg_pool2d(change[None], 7, 1, 3, count_include_pad=False)[0]  # grain of JPEG and demosaicing
     step = max(1, min(change.shape[1:]) // 60)
-    spread = spread_of(smooth[:, step // 2 :: step, step // 2 :: step].abs().flatten(1)[None], LEAST_SPREAD)[0]  # (3, 1)
+    spread = spread_of(smooth[:, step // 2 :: step, step // 2 :: step].abs().flatten(1)[None], LIGHT_DRIFT)[0]  # (3, 1)
     # a hundred times as fast as norm(dim=0)
     return (smooth / spread[..., None]).square().sum(0).sqrt(), float(spread.square().mean().sqrt())
 

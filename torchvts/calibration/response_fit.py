@@ -13,17 +13,13 @@ from ..model.response_field import (
     ResponseModel,
     SensorPrior,
     position_basis,
-    term_values,
 )
 from ..model.sensor import Sensor
-from ..model.stated_error import stated_deg, variance_of
+from ..model.stated_error import StatedError
 from .contacts import Contact, NoUsablePress, first_pass_depths
 from .field import Family, ball_sine
 from .outliers import locate_and_weigh
-from .posterior import Evidence, Posterior, largest, prior_of
-
-FEW = 3
-"""Presses from which the error is that of each by the others."""
+from .posterior import FEW, Evidence, largest, prior_of
 
 DEPTH_DEGREE = 2
 """Degree in position of what depth does to brightness."""
@@ -40,9 +36,6 @@ STEEPER = 1.0
 """``steeper`` of a :class:`DepthBrightness`, times half the longer side of the image: 3 h / d^2 of lights 1.2 to 1.6 times that
 far out and 0.6 to 1.4 times that high is 0.6 to 1.2. It is not fitted: at the rim of a ball the skin is shallow and steep, and
 leaves the ball, so balls teach a wrong value (docs/decisions.md)."""
-
-PLACES = 6
-"""Places along each side of the skin at which the stated error is taken."""
 
 
 class ResponseFit(NamedTuple):
@@ -95,25 +88,15 @@ def fit_response(contacts: list[Contact], sensor: Sensor, prior: SensorPrior | N
         by_depth = fit_depth_brightness(presses, found.field, pitch, None if prior is None else prior.response.by_depth)
         bar.update()
     model = ResponseModel(found.field, by_depth, sensor.exponent, sensor.blur_px)
-    stated = _stated_anywhere(found, presses, own_deg)
+    # of the presses' changes of light, all over the skin
+    changes = torch.cat([contact.change.flatten(1)[:, contact.index[contact.inside()]] for contact in presses], 1)
+    error = StatedError(own_deg, found.covariance, found.field, sensor.height, sensor.width, pitch)
+    stated = error.anywhere(changes[:, :: max(1, changes.shape[1] // 300)])
     return ResponseFit(model, found.covariance, own_deg, held_out_deg, stated)
 
 
 def _mean(errors_deg: Sequence[float], weights: Tensor) -> float:
     return float((torch.tensor(errors_deg, dtype=torch.float64) * weights).sum() / weights.sum())
-
-
-def _stated_anywhere(found: Posterior, contacts: Sequence[Contact], own_deg: float) -> float:
-    """Error to expect of the presses' changes of light at places all over the skin, degrees."""
-    changes = torch.cat([contact.change.flatten(1)[:, contact.index[contact.inside()]] for contact in contacts], 1)
-    changes = changes[:, :: max(1, changes.shape[1] // 300)]
-    steps = (torch.arange(PLACES, dtype=torch.float64) + 0.5) / PLACES * 2.0 - 1.0
-    half_mm = contacts[0].half_size_mm
-    x, y = (grid.reshape(-1, 1) for grid in torch.meshgrid(steps * half_mm[0], steps * half_mm[1], indexing="ij"))
-    everywhere = changes[:, None].expand(3, PLACES**2, changes.shape[1]).reshape(3, -1)
-    x, y = (place.expand(-1, changes.shape[1]).reshape(-1) for place in (x, y))
-    factors = term_values(everywhere, x, y, found.family.half_mm, found.family.degrees())
-    return float(stated_deg(own_deg, variance_of(factors, found.covariance).mean()))
 
 
 def fit_depth_brightness(

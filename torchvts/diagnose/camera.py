@@ -172,8 +172,4 @@ def _fine_power(image: Tensor, where: Tensor) -> float:
     planes = image.double()[None]
     fine = (planes - nn.functional.avg_pool2d(planes, 5, 1, 2, count_include_pad=False))[0][:, where]
     limit = 8.0 * fine.square().mean(1, keepdim=True).sqrt()
-    return float((fine.square() * (fine.abs() < limit)).mean(1).sum()) / BAND_NOISE
-
-
-BAND_NOISE = 0.96
-"""Variance that white noise of variance one keeps in what is left of an image without its means over 5 x 5 pixels."""
+    return float((fine.square() * (fine.abs() < limit)).mean(1).sum()) / (1.0 - 1.0 / 25.0)  # what white noise keeps is 1

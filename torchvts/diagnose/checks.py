@@ -11,6 +11,7 @@ from ..calibration import ROUGH, channel_structure
 from ..compensate.light import unevenness
 from ..core.frame import Conditions
 from ..core.levels import SATURATED
+from ..model.markers import FEWEST_DOTS
 from ..model.stated_error import stated_deg, stated_error_deg
 from ..model.summary import SATURATED_SHARE
 from ..model.usable import FrameCheck
@@ -20,9 +21,6 @@ from .examination import MISFITS, Examination
 from .findings import FAULT_DEG, WARNING_DEG, Finding, by_cost
 
 CHANNELS = ("red", "green", "blue")
-
-FEWEST_FREE_DOTS = 8
-"""Dots of free skin from which its shift is told."""
 
 LEAST_LIGHT = 0.05
 """Change of a channel's light that is reported, relative."""
@@ -307,7 +305,7 @@ def _dots_alike(e: Examination) -> Figures | None:
     pitch, size = e.motion.mm_per_pixel, (e.motion.width, e.motion.height)
     x, y = (e.motion.rest_mm / pitch + 0.5 * torch.tensor([size[0] - 1.0, size[1] - 1.0])).round().long().T
     moved = e.motion.displacement_mm[0, e.motion.seen[0] & e.free[y, x], :2] / pitch
-    if len(moved) < FEWEST_FREE_DOTS:
+    if len(moved) < FEWEST_DOTS:
         return None
     shift = moved.median(dim=0).values
     length, spread = float(shift.norm()), float((moved - shift).norm(dim=1).median())

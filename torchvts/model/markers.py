@@ -134,7 +134,7 @@ def fill_markers(image: Tensor, mask: Tensor, relaxations: int = 4) -> Tensor:
 
 
 FEWEST_DOTS = 8
-"""Dots that a skin has at least; fewer are dust."""
+"""Dots that a skin has at least, and from which its shift is told; fewer are dust."""
 
 LEAST_PRINTED = 20
 """Dots that a pattern has at least of which nothing is said; a Wedge's housing shows 10, a worn skin 7, patterns 63 and more."""

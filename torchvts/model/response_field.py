@@ -20,7 +20,7 @@ CHANGE_SCALE = 0.3
 MAX_SLOPE = 3.0
 """Largest steepness that a field gives, mm per mm: polynomials run away outside of what they were fitted on."""
 
-MAX_SINE = MAX_SLOPE / math.sqrt(1.0 + MAX_SLOPE**2)
+MAX_SINE = math.sin(math.atan(MAX_SLOPE))
 
 PRIOR_VERSION = 2
 """Version of a prior in a sensor file. One of another version is refused."""

@@ -156,6 +156,11 @@ class StatedError(nn.Module):
         variance = (products * self.maps.to(products.dtype)).sum(dim=1, keepdim=True).clamp_min(0.0)
         return stated_deg(self.own_deg, variance).clamp_max(90.0)
 
+    def anywhere(self, change: Tensor) -> float:
+        """Mean error of relative changes of light (3, N), each of which is as likely at every cell, degrees."""
+        products = self.products(change[None, :, None]).mean(dim=3)  # (1, P, 1)
+        return float(stated_deg(self.own_deg, (products * self.maps.to(products.dtype).flatten(2)).sum(dim=1).mean()))
+
 
 def stated_error_deg(calibration: Calibration, compensated: Tensor) -> Tensor:
     """Mean error of the normals at each pixel that the calibration states, degrees: :class:`StatedError` of its covariance.

@@ -23,15 +23,11 @@ from ..core.checks import (
     check_seed,
 )
 from ..core.files import load_tensors, save_tensors
-from ..core.geometry import normal_from_gradient
+from ..core.geometry import MAX_SLOPE, normal_from_gradient
 from .base import DOMAINS, NormalModel
 
 MLP_KIND = "mlp"
 OUTPUTS = ("angle", "gradient")
-MAX_ANGLE_RAD = math.radians(84.0)
-"""Angle of the steepest slope that the network returns."""
-MAX_GRADIENT = math.tan(MAX_ANGLE_RAD)
-"""Its tangent, 9.5 mm per mm."""
 
 
 class NormalFromMLP(NormalModel):
@@ -90,7 +86,7 @@ class NormalFromMLP(NormalModel):
             raise ValueError(f"output: expected one of {', '.join(OUTPUTS)}, got {output!r}")
         self.height, self.width = check_image_size("height", height, "width", width)
         self.output = output
-        self.most = MAX_ANGLE_RAD if output == "angle" else MAX_GRADIENT
+        self.most = math.atan(MAX_SLOPE) if output == "angle" else MAX_SLOPE
         widths = [5, *(check_integer("hidden", n, 1) for n in hidden), 2]
         if len(widths) < 3:
             raise ValueError("hidden: expected one width or more, got none")

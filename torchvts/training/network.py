@@ -10,8 +10,8 @@ from torch import Tensor, nn
 from tqdm import tqdm
 
 from ..core.checks import check_field, check_float_tensor, check_integer, check_least, check_range, check_shape, check_switch
+from ..core.geometry import MAX_SLOPE
 from ..normals import NormalFromMLP
-from ..normals.mlp import MAX_GRADIENT
 
 
 @dataclass(frozen=True, eq=False)
@@ -232,8 +232,8 @@ def _check_samples(intensity: Tensor, xy: Tensor, slope: Tensor, groups: Tensor)
     if not bool(torch.isfinite(xy.double()).all()):
         raise ValueError("xy: expected finite pixels, got NaN or infinite")
     steepest = float(slope.abs().max())
-    if not steepest <= MAX_GRADIENT:
+    if not steepest <= MAX_SLOPE:
         raise ValueError(
-            f"slope: expected finite slopes up to {MAX_GRADIENT:.1f}, got {steepest:.4g}: "
+            f"slope: expected finite slopes up to {MAX_SLOPE:.1f}, got {steepest:.4g}: "
             "keep 3 pixels inside the rim of the ball's contact"
         )

@@ -305,14 +305,16 @@ def test_a_frame_becomes_a_keyframe_before_what_shows_the_rotation_is_gone(monke
     late = tracking.Motion(13, lambda k, seed: slow(k and 27 + k, seed))
     track = tracking.record(objects.TARGETS["bolt head"], late, 0.005, 22, pose_accuracy.rig())
     worst = []
-    for vaguer in (tracker_module.VAGUER, math.inf):
-        monkeypatch.setattr(tracker_module, "VAGUER", vaguer)
+    of_contact = tracker_module.in_common
+    for by_variance in (True, False):
+        if not by_variance:
+            monkeypatch.setattr(tracker_module, "in_common", lambda *values: (of_contact(*values)[0], 1.0))
         tracker = vts.PoseTracker(track.frames[0], track.mm_per_pixel)
         tracker.restart(track.poses[1] @ invert(track.poses[0]))
         found = [tracker(frame) for frame in track.frames[1:]]
         worst.append(max(tracking.tracking_error(pose, track, k)[0] for k, pose in enumerate(found, 1)))
         assert all(pose.overlap > 0.75 for pose in found[:-2])
-        assert (found[-1].keyframe > 0) == (vaguer < 100.0)
+        assert (found[-1].keyframe > 0) == by_variance
     assert worst[0] < 0.1 < 0.2 < worst[1]
 
 

@@ -41,8 +41,6 @@ LEAST_FITNESS, LEAST_OVERLAP, MOST_COST = 0.85, 0.3, 0.25
 COARSE_WINDOW, FINE_WINDOW = np.ones(3), np.array([1.0, 4.0, 6.0, 4.0, 1.0])
 """Weights of neighbours along each side in second derivatives, whose noise looks like information on the pose."""
 
-SCORE = (1.0 / (CUT * SLOPE_NOISE) ** 2, 1.0 / (CUT * HEIGHT_NOISE_MM) ** 2)
-
 
 class Points(NamedTuple):
     """Pixels of a reference and their derivatives by a scaled twist about ``center``.
@@ -263,7 +261,8 @@ def residual_limits(grid: Grid, pose: Array, slope_noise: float) -> Array:
     limits = np.empty(25)
     limits[:16] = pose.ravel()
     limits[16:] = (
-        grid.x0, grid.y0, grid.pitch, slope_noise**-2, DEPTH_DRIFT_MM**-2, *SCORE, DEEP_MM, SHALLOW_MM,
+        grid.x0, grid.y0, grid.pitch, slope_noise**-2, DEPTH_DRIFT_MM**-2,
+        (CUT * SLOPE_NOISE) ** -2, (CUT * HEIGHT_NOISE_MM) ** -2, DEEP_MM, SHALLOW_MM,
     )  # fmt: skip
     return limits
 

@@ -16,10 +16,10 @@ from .direct import equal_poses, likely_poses, symmetries
 from .dots import carried, fused, points_under
 from .follow import TRUSTED_DEG, TRUSTED_MM, Followed, follow, in_common
 from .grids import LEAST_CELLS, DepthFrame, Grids, Surface, Unusable, grids, pitch_by_slopes, surface_of
+from .inverse import LEAST_SLOPE_NOISE
 from .keyframe import KeyframeGraph, make_keyframe
 from .result import Registration
 from .rigid import Array, cross, distance_mm, moved_covariance, orthonormal
-from .uncertainty import LEAST_SLOPE_NOISE
 
 HALF = 0.5
 """A keyframe that shows half as much as it could makes room for another one: half of the smaller contact is in common, the variance

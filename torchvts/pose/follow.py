@@ -7,7 +7,7 @@ import numpy as np
 
 from .ambiguity import LEAST_INFORMATION, UNKNOWN_VARIANCE, free_directions, information_of_noise, name_directions, span
 from .grids import Grids
-from .height_errors import covariance_with_heights, height_sums
+from .height_errors import WHITE_MM, covariance_with_heights, height_sums
 from .inverse import (
     LEAST_SLOPE_NOISE,
     ROTATION_FIRST,
@@ -33,9 +33,6 @@ MOST_STEPS = 30
 SMALL_MM, SMALLEST_MM = 0.02, 2e-3
 """Steps so small, at the contact, are the last ones on the coarse grid and on the fine one; where the very last step is larger than
 the first of these, the pose is not settled."""
-
-HEIGHT_OFFSET_MM = 0.02
-"""Error of all heights of a contact alike, which its frames cannot show: the relief of a real GelSight Mini errs by so much."""
 
 TRUSTED_DEG, TRUSTED_MM = 1.0, 0.15
 """A pose is trusted if three times its standard deviations are within these."""
@@ -114,7 +111,7 @@ def _follow_from(keyframe: Keyframe, frame: Grids, start: Array, last: Array) ->
     if unknown.shape[1] == 0:
         fine, both = _with_heights(fine, keyframe, frame, refined)
         step, scaled = solve_step(both), covariance_with_heights(fine, both, scaled)
-    scaled[5, 5] += fine.depth_noise**2 + HEIGHT_OFFSET_MM**2
+    scaled[5, 5] += fine.depth_noise**2 + WHITE_MM**2
     pose, origin = _kept(keyframe, unknown, last, refined @ moved_by(keyframe.many, step)), keyframe.many.to_origin()
     return Followed(
         pose=pose,

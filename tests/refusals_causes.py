@@ -87,7 +87,7 @@ CAUSES = [
     ("register_depth", "initial", TRANSPOSED, "expected a rigid motion .*the last row .* transposed"),
     ("register_depth", "target", FAINT, "target: .*pressed too faintly"),
     ("register_points", "source", torch.zeros(0, 3), r"expected points, got none: no contact\?"),
-    ("register_points", "source", torch.ones(50, 3), "expected at least 10 distinct points, got 1 of 50"),
+    ("register_points", "source", torch.ones(50, 3), "expected at least 12 distinct points, got 1 of 50"),
     ("register_points", "source", POINTS.expand(50, 3), "expected a surface, got points on one line"),
     ("diagnose", "image", 255 * GOOD, "divide by 255"),
     ("ContactFromDepth.forward", "depth_mm", DEPTH[0], "add the batch dimension"),

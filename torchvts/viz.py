@@ -52,11 +52,13 @@ NAME_SHOWN = 22
 PRESSES_SHOWN = 6
 """Presses in the picture of a calibration."""
 
-MOST_POINTS = 220
+MOST_POINTS = 160
 """Largest number of points of a surface in each direction."""
 
+ROUND = (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0)
+"""Round values, between two powers of ten."""
+
 _HALO = [patheffects.withStroke(linewidth=2.0, foreground="black")]
-_EXAGGERATIONS = (1, 2, 3, 4, 5, 8, 10, 15, 20, 30, 40, 50, 80, 100, 150, 200, 300, 400, 500, 1000)
 
 
 def new_figure(width: float, height: float, dpi: int = 150) -> Figure:
@@ -222,9 +224,10 @@ def exaggeration_of(height_mm: float, width_mm: float) -> float:
 
     Example:
         >>> exaggeration_of(0.4, 20.0)
-        5.0
+        6.0
     """
-    return float(max((f for f in _EXAGGERATIONS if f * height_mm <= 0.15 * width_mm), default=1))
+    factors = [power * value for power in (1.0, 10.0, 100.0) for value in ROUND]
+    return max((factor for factor in factors if factor * height_mm <= 0.15 * width_mm), default=1.0)
 
 
 def draw_surface(axes: Any, depth: Array, mm_per_pixel: float, exaggeration: float | None = None) -> None:

@@ -22,9 +22,6 @@ from ..stream.sources import NumberedFrame
 from ..viz import calibration_figure, save_figure
 from .options import calibrated, read_folder, working
 
-LONG = 300
-"""Frames after which a press that is not lifted is perhaps none."""
-
 
 class Session:
     """Background and presses of a unit as they come, in a folder of gs_sdk's layout; what lies there already is gone on with.
@@ -166,7 +163,7 @@ class Guide:
         self.until_deg, self.picture, self.force = until_deg, picture, force
         self.unit: Calibration | None = None
         self._said, self._where = "", "anywhere, 0.3 to 0.8 mm deep"
-        self._lifted, self._held = False, 0
+        self._lifted = False
         self._say(
             f"{session.folder} keeps the background and each press, {picture} shows them; Ctrl-C ends, the same command goes on"
         )
@@ -192,14 +189,9 @@ class Guide:
             self._lifted = True
             self._say(f"press the ball of {self.ball_diameter_mm:g} mm and hold it still: {self._where}")
         elif not self._lifted:
-            self._held += 1
-            self._say(
-                "lift the ball"
-                if self._held < LONG
-                else "lifted, and yet other light than the background's? Begin another --session"
-            )
+            self._say("lift the ball; where that is lifted, other light falls than in the background: begin another --session")
         elif not self.watch.moves():
-            self._lifted, self._held = False, 0
+            self._lifted = False
             self.session.add(self.watch.picture(), self.ball_diameter_mm)
             self._judge()
         return not self.reached

@@ -25,7 +25,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..core.checks import check_positive
+from ..core.checks import NAMED, check_positive
 from ..core.files import Pixels, check_folder, make_folder, read_image, write_atomically
 from ..model.summary import NOT_METRIC
 from ..pose import OutputFrame, PoseTracker, TrackedPose
@@ -238,7 +238,7 @@ def _print_summary(found: dict[str, Any]) -> None:
     loops = len(found["loops_closed"])
     counts = _several(found["frames"], "frame"), f"{found['lost']} lost", _several(found["keyframes"], "keyframe")
     print(", ".join((*counts, f"{_several(loops, 'loop')} closed")))
-    for reason in list(found["lost_because"])[:5]:
+    for reason in list(found["lost_because"])[:NAMED]:
         print(f"  lost: {reason}")
     if found["left_out"]:
         print(f"  {_several(found['left_out'], 'frame')} left out, named above")

@@ -27,6 +27,9 @@ MOST_PIXELS = 2**26
 MOST_DECAY_MM = 10.0
 """Free skin decays within less: more is a length in um."""
 
+NAMED = 5
+"""So many of what is wrong are named at once; a folder of another sensor's has thousands."""
+
 MOST_COUNT = 2**31 - 1
 """No count of anything here is larger; larger integers are refused before they reach an operator, which overflows."""
 

@@ -14,14 +14,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from .checks import NAMED
 from .files import IMAGE_SUFFIXES, IN_COLOUR, Pixels, check_colour, check_still_head, decode_bytes, natural_order
 from .videos import video_reads
 
 BLOCK = 64
 """Frames of an array that are read at once, where its chunks are not smaller."""
-
-NAMED = 5
-"""So many arrays are named where none holds images."""
 
 EXTRA = "pip install 'torchvts[containers]'"
 

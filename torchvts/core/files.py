@@ -45,11 +45,14 @@ IN_COLOUR = 6
 MOST_OF_12_BITS = 4095
 """An image of 16 bits whose values stay below this is black, or of 12 bits."""
 
-MOST_BYTES = 2**29
-"""A larger image file is not read."""
+MOST_BYTES = 2**31
+"""A larger file of an image, of tensors or of points is not read."""
 
-MOST_TENSOR_BYTES = 2**31
-"""A larger file of tensors is not read."""
+
+def check_size(path: Path, kind: str) -> None:
+    """Raise ValueError where a file is larger than :data:`MOST_BYTES`, and so no file of the kind."""
+    if (size := path.stat().st_size) > MOST_BYTES:
+        raise ValueError(f"{path}: expected {kind} of at most {MOST_BYTES} bytes, got {size}: another file?")
 
 
 def check_target(path: str | Path) -> Path:
@@ -277,10 +280,9 @@ def decode_image(path: Path, flags: int) -> Pixels | None:
         ValueError: larger than :data:`MOST_BYTES`, or a PNG whose header gives more than :data:`MOST_PIXELS`, as a
             file of some kilobytes can.
     """
-    size = path.stat().st_size
-    if size > MOST_BYTES:
-        raise ValueError(f"{path}: expected an image of at most {MOST_BYTES} bytes, got {size}: not an image")
-    return decode_bytes(np.fromfile(path, dtype=np.uint8), flags, str(path)) if size else None
+    check_size(path, "an image")
+    data = np.fromfile(path, dtype=np.uint8)
+    return decode_bytes(data, flags, str(path)) if len(data) else None
 
 
 def decode_bytes(data: np.ndarray[Any, Any], flags: int, source: str) -> Pixels | None:
@@ -446,8 +448,7 @@ def load_tensors(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     path = check_path("path", path)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file")
-    if (size := path.stat().st_size) > MOST_TENSOR_BYTES:
-        raise ValueError(f"{path}: not a safetensors file of torchvts: expected at most {MOST_TENSOR_BYTES} bytes, got {size}")
+    check_size(path, "a safetensors file of torchvts")
     try:
         content = path.read_bytes()  # read here: safetensors opens no names that are not UTF-8
         tensors = safetensors.torch.load(content)

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from ..core.checks import in_one_line
+from ..core.checks import NAMED, in_one_line
 from ..core.recordings import count_frames, cut_short
 from ..model import Calibration
 from ..pipeline import DepthOutput
@@ -52,9 +52,6 @@ class RunReport(NamedTuple):
     notes: Sequence[tuple[str, str]] = ()
     doubted: Sequence[tuple[str, str]] = ()
 
-
-NAMED = 5
-"""So many frames that cannot be used are named at once, by each process; a folder of another sensor's has thousands."""
 
 _Reconstructed = tuple[Entry, Tensor | None, DepthOutput | None]
 """A frame, its image, and its depth."""

@@ -14,7 +14,7 @@ from ..compiled import NotCompiled, Plan, PlanError, check_block, library, plan_
 from ..compiled import blocks as compiled
 from ..core import __version__
 from ..core.checks import check_batch, check_image, check_path, check_range, check_record, check_same_size
-from ..core.files import MOST_TENSOR_BYTES, write_atomically
+from ..core.files import check_size, write_atomically
 from ..core.frame import Conditions, DepthOutput
 from .depth import DepthPipeline
 from .refine import Refine
@@ -111,8 +111,7 @@ class FrozenPipeline:
         path = check_path("path", path)
         if not path.is_file():
             raise FileNotFoundError(f"{path}: no such file")
-        if (size := path.stat().st_size) > MOST_TENSOR_BYTES:
-            raise ValueError(f"{path}: expected a plan of at most {MOST_TENSOR_BYTES} bytes, got {size}: another file?")
+        check_size(path, "a plan")
         if library() is None:
             raise RuntimeError(f"{path}: a plan needs the compiled library, and there is none: {why_no_library()}")
         try:

@@ -5,7 +5,18 @@ import math
 import numpy as np
 
 from .grids import Grid
-from .inverse import CUT, LEAST_OVERLAP, SHALLOW_MM, SLOPE_NOISE, Points, center_and_units, points_of, residual_limits, residuals
+from .inverse import (
+    CUT,
+    HEIGHT_NOISE_MM,
+    LEAST_OVERLAP,
+    SHALLOW_MM,
+    SLOPE_NOISE,
+    Points,
+    center_and_units,
+    points_of,
+    residual_limits,
+    residuals,
+)
 from .rigid import Array, adjoint, rigid_motion
 
 SINE_OF_AXIS = 0.3
@@ -17,8 +28,8 @@ SHIFT = 0.995
 LEAST_INFORMATION = 0.12
 """Squared change of slope, in units of its noise, per squared mm of motion, below which a motion is unknown: 0.02 a mm."""
 
-HEIGHT_RATIO = SLOPE_NOISE / 0.15
-"""Heights that differ by 0.15 mm count as slopes that differ by their noise."""
+NOISE = np.array([SLOPE_NOISE, SLOPE_NOISE, HEIGHT_NOISE_MM])
+"""Of p, q and z."""
 
 DEEP = 0.6
 """Share of the largest depth above which the skin certainly lies on the object."""
@@ -156,8 +167,7 @@ def _is_one_hill(grid: Grid) -> bool:
 
 def _information(points: Points) -> Array:
     """(6, 6), mean over pixels of J^T J in units of the noise."""
-    by = points.columns[5:].double().numpy().reshape(3, 6, -1) / SLOPE_NOISE
-    by[2] *= HEIGHT_RATIO
+    by = points.columns[5:].double().numpy().reshape(3, 6, -1) / NOISE[:, None, None]
     information: Array = np.einsum("rin,rkn->ik", by, by, optimize=True) / points.number
     return information
 
@@ -166,7 +176,7 @@ def _rolls(grid: Grid, deep: Points, motions: Array) -> Array:
     """Which motions (6, K) turn the deep part's normals and leave its fit unchanged, by steps of some length; bool (K,)."""
     columns = deep.columns[:5].contiguous()
     p, q = columns[3:].double().numpy()
-    turn = np.stack(((p * q, -(1.0 + p * p), -q), (1.0 + q * q, -p * q, p)))  # (2, 3, N), of slopes by a rotation
+    turn = np.stack(((p * q, -(1.0 + p * p), -q), (1.0 + q * q, -p * q, p))) / SLOPE_NOISE  # (2, 3, N), of slopes by a rotation
     rolls = np.zeros(motions.shape[1], bool)
     for k, twist in enumerate((motions * deep.units[:, None]).T):
         turned = float(np.square(np.einsum("rin,i->rn", turn, twist[:3])).sum(0).mean())
@@ -179,8 +189,7 @@ def _rolls(grid: Grid, deep: Points, motions: Array) -> Array:
                 compared = found.inside & (found.height > SHALLOW_MM)
                 if compared.sum() <= LEAST_OVERLAP * deep.number:
                     break
-                squared = np.square(found.values[:2]).sum(0) + np.square(HEIGHT_RATIO * found.values[2])
-                rises.append(float(np.minimum(squared, (CUT * SLOPE_NOISE) ** 2)[compared].mean()))
-            noise = 2.0 * SLOPE_NOISE**2
-            rolls[k] |= len(rises) == 2 and max(rises) < noise and turned * step**2 > max(times * max(rises), noise)
+                squared = np.square(found.values / NOISE[:, None]).sum(0)
+                rises.append(float(np.minimum(squared, CUT**2)[compared].mean()))
+            rolls[k] |= len(rises) == 2 and max(rises) < 2.0 < turned * step**2 > times * max(rises)
     return rolls

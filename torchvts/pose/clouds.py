@@ -12,6 +12,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from ..core.checks import check_integer, check_path, check_positive
+from ..core.files import check_size
 from ..core.geometry import depth_to_points
 from ..core.morphology import dilate
 from . import read_cloud
@@ -25,9 +26,6 @@ CLOUD_SUFFIXES = (".pcd", ".ply")
 SPREAD = (0.7548776662466927, 0.5698402909980532)
 """Multiples of the row and the column of a pixel, modulo 1, by which a part of the pixels is spread evenly over the image (Roberts,
 The unreasonable effectiveness of quasirandom sequences, 2018)."""
-
-HEAD_BYTES, MOST_BYTES = 2**16, 2**31
-"""Largest header of a file, and largest file, that is read."""
 
 
 def contact_cloud(frame: DepthFrame, mm_per_pixel: float, most: int | None = 1000) -> tuple[Tensor, Tensor]:
@@ -100,10 +98,10 @@ def read_point_cloud(path: str | Path) -> tuple[Tensor, Tensor | None]:
         raise FileNotFoundError(f"{path}: no such point cloud")
     if path.suffix.lower() not in CLOUD_SUFFIXES:
         raise ValueError(f"{path}: expected a name ending in {' or '.join(CLOUD_SUFFIXES)}, got {path.suffix!r}")
-    if path.stat().st_size > MOST_BYTES:
-        raise ValueError(f"{path}: expected a point cloud of at most {MOST_BYTES} bytes, got {path.stat().st_size}")
+    check_size(path, "a point cloud")
     data = path.read_bytes()
-    announced = re.search(rb"^(?:POINTS|element\s+vertex)\s+(\d{1,18})\s*$", data[:HEAD_BYTES], re.MULTILINE)
+    head = re.split(rb"\n(?:DATA|end_header)", data, maxsplit=1)[0]
+    announced = re.search(rb"^(?:POINTS|element\s+vertex)\s+(\d{1,18})\s*$", head, re.MULTILINE)
     number = int(announced[1]) if announced else 0
     if not 0 < number <= 256 * len(data):  # a byte of a compressed file stands for 256 at most
         raise ValueError(f"{path}: no points could be read: no point cloud, or its header says {number} points")

@@ -20,13 +20,13 @@ from .inverse import SLOPE_NOISE, Points, Score, bare_points, center_and_units, 
 from .keyframe import Keyframe, make_keyframe
 from .result import Registration
 from .rigid import Array, distance_mm, orthonormal, rotation_vector
-from .search import search_plane
+from .search import SAME_MM, search_plane
 
 MOST_TURNS, MOST_AGAIN = 4, 16
 """Rotations with which shifts are searched again, and hypotheses that come of it, at most."""
 
-SAME_MM, MOST_TRIED = 0.4, 72
-"""Poses that move the contact to so nearly the same place are one, mm; and so many starts are tried for equal poses at most."""
+MOST_TRIED = 72
+"""So many starts are tried for equal poses at most."""
 
 EQUAL, EQUAL_COST = 2.3, 0.008
 """Poses are equal whose costs on the fine grid are within so many times the least one, or so much more. A bolt head turned by 10
@@ -156,7 +156,7 @@ def symmetries(keyframe: Keyframe) -> list[Array]:
     poses, score = search_plane(keyframe.grids.coarse, keyframe.grids.coarse)
     starts = list(poses[score > 0.4 * score[:1]].numpy())
     found = _refined(keyframe, keyframe.grids, bare_points(keyframe.grids.coarse), [np.eye(4), *starts], 9)
-    return [pose for pose, score in found if score.is_enough() and distance_mm(keyframe.spread, pose, np.eye(4)) > SAME_MM]
+    return [pose for pose, score in found if score.is_enough and distance_mm(keyframe.spread, pose, np.eye(4)) > SAME_MM]
 
 
 def equal_poses(keyframe: Keyframe, frame: Grids, starts: list[Array], motions: Sequence[Array] = ()) -> list[Followed]:

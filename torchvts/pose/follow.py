@@ -7,9 +7,9 @@ import numpy as np
 
 from .ambiguity import LEAST_INFORMATION, UNKNOWN_VARIANCE, free_directions, information_of_noise, name_directions, span
 from .grids import Grids
-from .height_errors import covariance_with_heights, height_sums
+from .height_errors import WHITE_MM, covariance_with_heights, height_sums
 from .inverse import (
-    LEAST_NOISE,
+    LEAST_SLOPE_NOISE,
     ROTATION_FIRST,
     SLOPE_NOISE,
     Score,
@@ -25,7 +25,7 @@ from .inverse import (
 )
 from .keyframe import Keyframe
 from .rigid import Array, moved_covariance
-from .uncertainty import LEAST_SLOPE_NOISE, PARTS, covariance_of_slopes
+from .uncertainty import PARTS, covariance_of_slopes
 
 MOST_STEPS = 30
 """Largest number of steps on the coarse grid, and with some pixels of the fine one."""
@@ -34,14 +34,8 @@ SMALL_MM, SMALLEST_MM = 0.02, 2e-3
 """Steps so small, at the contact, are the last ones on the coarse grid and on the fine one; where the very last step is larger than
 the first of these, the pose is not settled."""
 
-HEIGHT_OFFSET_MM = 0.02
-"""Error of all heights of a contact alike, which its frames cannot show: the relief of a real GelSight Mini errs by so much."""
-
 TRUSTED_DEG, TRUSTED_MM = 1.0, 0.15
-"""A pose is trusted if three times its standard deviations are within these; a motion of larger ones is called unknown."""
-
-ALIKE_PIXELS = 25.0
-"""Number of fine pixels over which slope errors are alike, where it is asked whether a motion is shown at all."""
+"""A pose is trusted if three times its standard deviations are within these."""
 
 LEAST_SHARE = 1e-4
 """Of all information: a direction of less has so much."""
@@ -75,11 +69,9 @@ class Followed(NamedTuple):
     @property
     def misfit(self) -> str:
         """Why the pose is none, in words; empty if the frames agree well enough on a large enough part, and show any motion."""
-        if self.score.is_enough():
+        if self.score.is_enough:
             return "the contact is too small: no motion of it is known" if self.free.shape[1] == 6 else ""
-        if self.score.is_enough(math.inf):
-            return f"nothing fits well: {self.score.share}, but all of it differs: different objects, or slopes that err by degrees"
-        return f"nothing fits: {self.score.share}: different objects, or parts of one that hardly overlap"
+        return f"nothing fits: {self.score.share}: other objects, slopes that err by degrees, or parts that hardly overlap"
 
     @property
     def exact(self) -> bool:
@@ -110,20 +102,16 @@ def _follow_from(keyframe: Keyframe, frame: Grids, start: Array, last: Array) ->
     unknown = _sliding(keyframe, coarse)
     pose = _kept(keyframe, unknown, last, pose)
     refined, some = refine(frame.fine, keyframe.some, pose, MOST_STEPS, SLOPE_NOISE, unknown, SMALLEST_MM)
-    vague = _vague(keyframe, some)
-    if vague.shape[1] > 0:
-        unknown = span(np.hstack((unknown, vague)))
-        pose = _kept(keyframe, unknown, last, pose)
-        refined, some = refine(frame.fine, keyframe.some, pose, MOST_STEPS, SLOPE_NOISE, unknown, SMALLEST_MM)
-    noise = max(LEAST_NOISE, 1.5 * some.slope_noise)
+    noise = max(LEAST_SLOPE_NOISE, 1.5 * some.slope_noise)
     fine, matrices, rights = sum_parts(frame.fine, keyframe.many, refined, noise, PARTS)
+    unknown = unknown if fine.used else np.eye(6)  # led astray, to where nothing is in common
     by_slopes = solve_step(fine, unknown)
     scaled = covariance_of_slopes(fine, matrices, rights, keyframe.shared_error, unknown)
     step = by_slopes
     if unknown.shape[1] == 0:
         fine, both = _with_heights(fine, keyframe, frame, refined)
         step, scaled = solve_step(both), covariance_with_heights(fine, both, scaled)
-    scaled[5, 5] += fine.depth_noise**2 + HEIGHT_OFFSET_MM**2
+    scaled[5, 5] += fine.depth_noise**2 + WHITE_MM**2
     pose, origin = _kept(keyframe, unknown, last, refined @ moved_by(keyframe.many, step)), keyframe.many.to_origin()
     return Followed(
         pose=pose,
@@ -177,13 +165,3 @@ def _sliding(keyframe: Keyframe, coarse: Sums) -> Array:
     information = coarse.matrix * ((coarse.noise / SLOPE_NOISE) ** 2 / max(coarse.used, 1))
     bias = information_of_noise(keyframe.resolution.noise, keyframe.grids.coarse.pitch)
     return span(np.hstack((free_directions(information, bias, LEAST_INFORMATION), keyframe.held)))
-
-
-def _vague(keyframe: Keyframe, some: Sums) -> Array:
-    """Motions whose standard deviation is too large, because the common contact is small or faint."""
-    wanted = np.concatenate((math.radians(TRUSTED_DEG) / keyframe.some.units[:3], np.full(3, TRUSTED_MM)))
-    alike = max(1.0, ALIKE_PIXELS * keyframe.some.number / keyframe.grids.touching)
-    ratio = max(some.slope_noise, LEAST_SLOPE_NOISE) / some.noise
-    matrix = some.matrix * wanted[:, None] * wanted / (alike * ratio**2)
-    precision, directions = np.linalg.eigh(matrix)  # 1 where the standard deviation is as wanted
-    return np.linalg.qr(directions[:, precision < 1.0] * wanted[:, None])[0]

@@ -16,8 +16,8 @@ from .rigid import Array
 LEAST_DEPTH_MM = 0.03
 """Skin less deep than this counts as the transition zone around a contact, where it does not lie on the object."""
 
-LEAST_SIDE, LEAST_CELLS = 16, 12
-"""Least pixels along the shorter side of a frame, and least cells of a contact on the coarse grid."""
+LEAST_CELLS = 12
+"""A pose needs so many cells of a contact on the coarse grid, points of a cloud, and pixels along the shorter side of a frame."""
 
 HUGE = 1e6
 """Depth, mm, and slopes beyond this are no measurement; their squares would overflow."""
@@ -170,8 +170,8 @@ def resolution_of(surface: Surface, mm_per_pixel: float, name: str) -> Resolutio
         ValueError: too few pixels, or a strip.
     """
     height, width = surface.depth_mm.shape[-2:]
-    if min(height, width) < LEAST_SIDE:
-        raise ValueError(f"{name}: expected a frame of at least {LEAST_SIDE} x {LEAST_SIDE}, got {height} x {width}")
+    if min(height, width) < LEAST_CELLS:
+        raise ValueError(f"{name}: expected a frame of at least {LEAST_CELLS} x {LEAST_CELLS}, got {height} x {width}")
     fine = math.ceil(max(height, width) / 330)
     coarse = max(fine, round(max(height, width) / 80))
     if min(height, width) < 2 * coarse:

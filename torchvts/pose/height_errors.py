@@ -28,7 +28,8 @@ ERROR, FINE_SHARE, FINE_CELLS = 0.037, 0.3, 0.2
 share of these that the mean of a cell keeps."""
 
 WHITE_MM = 0.02
-"""What heights err by beside, cell by cell: it makes up for what the model of the errors has wrong."""
+"""What heights err by beside: cell by cell, which makes up for what the model of the errors has wrong, and alike over a contact,
+which its frames cannot show. The relief of a real GelSight Mini errs by so much."""
 
 MOST_MM = 2.0 * HEIGHT_NOISE_MM
 """Heights of a pixel that differ by more than this do not count."""

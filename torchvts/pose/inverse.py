@@ -29,19 +29,20 @@ HEIGHT_NOISE_MM = 0.1
 CUT = 4.0
 """A pixel whose residual exceeds this multiple of the noise is an outlier."""
 
-DEEP_MM, SHALLOW_MM = 0.06, 0.02
-"""Reference pixels that should be deeper than this under a pose count in its score; in its refinement from the second on."""
+SHALLOW_MM = 0.02
+"""Reference pixels that should be deeper than this under a pose count."""
 
-LEAST_NOISE, LARGEST_STEP_MM = 0.02, 0.6
-"""Slope noise down to which the weights narrow, and the largest step, mm at the contact."""
+LEAST_SLOPE_NOISE = 1e-3
+"""Slopes of pixels err by so much at least."""
 
-LEAST_FITNESS, LEAST_OVERLAP, MOST_COST = 0.85, 0.3, 0.25
-"""Thresholds that a score must reach to be trusted."""
+LARGEST_STEP_MM = 0.6
+"""Of a refinement, at the contact: a small part of one asks for large ones by noise alone."""
+
+LEAST_OVERLAP, MOST_COST = 0.3, 0.25
+"""Limits within which a score is trusted."""
 
 COARSE_WINDOW, FINE_WINDOW = np.ones(3), np.array([1.0, 4.0, 6.0, 4.0, 1.0])
 """Weights of neighbours along each side in second derivatives, whose noise looks like information on the pose."""
-
-SCORE = (1.0 / (CUT * SLOPE_NOISE) ** 2, 1.0 / (CUT * HEIGHT_NOISE_MM) ** 2)
 
 
 class Points(NamedTuple):
@@ -109,9 +110,10 @@ class Score(NamedTuple):
     overlap: float
     cost: float
 
-    def is_enough(self, most_cost: float = MOST_COST) -> bool:
+    @property
+    def is_enough(self) -> bool:
         """Whether the pose can be trusted."""
-        return self.fitness >= LEAST_FITNESS and self.overlap >= LEAST_OVERLAP and self.cost <= most_cost
+        return self.overlap >= LEAST_OVERLAP and self.cost <= MOST_COST
 
     @property
     def share(self) -> str:
@@ -189,7 +191,7 @@ def refine(
         sums = sum_residuals(grid, points, pose, noise)
         step = solve_step(sums, held)
         pose = pose @ moved_by(points, step)
-        noise = max(LEAST_NOISE, 1.5 * sums.slope_noise, 0.5 * noise)
+        noise = max(LEAST_SLOPE_NOISE, 1.5 * sums.slope_noise, 0.5 * noise)
         if float(np.abs(step).max()) < small_mm:
             break
     return pose, sums
@@ -259,11 +261,12 @@ def _alignment_sums(channels: Tensor, columns: Tensor, limits: Array, score_only
 
 
 def residual_limits(grid: Grid, pose: Array, slope_noise: float) -> Array:
-    """What the residuals depend on beside the pixels, (25,)."""
-    limits = np.empty(25)
+    """What the residuals depend on beside the pixels, (24,)."""
+    limits = np.empty(24)
     limits[:16] = pose.ravel()
     limits[16:] = (
-        grid.x0, grid.y0, grid.pitch, slope_noise**-2, DEPTH_DRIFT_MM**-2, *SCORE, DEEP_MM, SHALLOW_MM,
+        grid.x0, grid.y0, grid.pitch, slope_noise**-2, DEPTH_DRIFT_MM**-2,
+        (CUT * SLOPE_NOISE) ** -2, (CUT * HEIGHT_NOISE_MM) ** -2, SHALLOW_MM,
     )  # fmt: skip
     return limits
 
@@ -315,9 +318,9 @@ def residuals(channels: Tensor, columns: Tensor, limits: Array) -> Residuals:
 def alignment_sums(channels: Tensor, columns: Tensor, limits: Array, score_only: bool = False) -> Array:
     """Sums (56,) float64: 7 x 7 products of the Jacobian and the residual, zero with ``score_only``, then seven of the score."""
     found = residuals(channels, columns, limits)
-    per_slope, per_height, score_slope, score_height, deep, shallow = limits[19:].astype(np.float32)
+    per_slope, per_height, score_slope, score_height, shallow = limits[19:].astype(np.float32)
     off, high = np.square(found.values[:2]).sum(0), np.square(found.values[2])
-    counted = found.seen & (found.height > deep)
+    counted = found.seen & (found.height > shallow)
     error = np.where(found.inside, np.minimum(off * score_slope + high * score_height, 1.0), 1.0)[counted]
     used = found.inside & (found.height > shallow)
     weight = used / (1.0 + 0.25 * (off * per_slope + high * per_height))

@@ -10,12 +10,10 @@ from torch import Tensor
 from ..core.checks import check_float_tensor
 from ..core.geometry import check_rigid
 from .ambiguity import UNKNOWN_VARIANCE, free_directions, name_directions
+from .grids import LEAST_CELLS
 from .read_cloud import open3d
 from .result import Registration
 from .rigid import Array
-
-LEAST_POINTS = 10
-"""Least number of points of a cloud that has a pose."""
 
 SEARCH_POINTS = 1000
 """Points to which clouds are thinned for sample consensus."""
@@ -58,7 +56,7 @@ def register_points(
     Returns:
         The registration; ``converged`` is False if nothing fits.
     Raises:
-        ValueError: not (N, 3), not finite, fewer than 10 distinct points, or points on one line.
+        ValueError: not (N, 3), not finite, fewer than 12 distinct points, or points on one line.
         TypeError: no tensors.
         ImportError: Open3D is not installed.
     Source:
@@ -105,8 +103,8 @@ def _checked(name: str, points: Tensor, normals: Tensor | None) -> tuple[Tensor,
         if not bool((normals.norm(dim=1) > 0.5).all()):
             raise ValueError(f"{name}_normals: expected unit normals, got some of no length")
     first = np.sort(np.unique(points.numpy(), axis=0, return_index=True)[1])
-    if len(first) < LEAST_POINTS:
-        raise ValueError(f"{name}: expected at least {LEAST_POINTS} distinct points, got {len(first)} of {len(points)}")
+    if len(first) < LEAST_CELLS:
+        raise ValueError(f"{name}: expected at least {LEAST_CELLS} distinct points, got {len(first)} of {len(points)}")
     points, normals = points[first], None if normals is None else normals[first]
     spread = torch.linalg.svdvals(points - points.mean(0))
     if float(spread[1]) < 1e-6 * float(spread[0]):
@@ -164,7 +162,7 @@ def _refined(o3d: Any, source: Any, target: Any, pose: Any) -> Registration:
     rmse_mm = math.sqrt(float(np.square(((paired - goal) * normal).sum(1)).mean())) if len(pairs) else math.inf
     share = f"{100 * fitness:.0f} % of the points have a neighbour in the other cloud"
     thickness = math.sqrt(max(float(np.linalg.eigvalsh(np.cov(np.asarray(target.points).T))[0]), 0.0))
-    if fitness < LEAST_SHARE or rmse_mm > max(MOST_RMSE * thickness, 0.05 * reach) or len(pairs) < LEAST_POINTS:
+    if fitness < LEAST_SHARE or rmse_mm > max(MOST_RMSE * thickness, 0.05 * reach) or len(pairs) < LEAST_CELLS:
         unknown = torch.diag(torch.tensor([1.0] * 3 + [UNKNOWN_VARIANCE] * 3, dtype=torch.float64))
         share = f"{share}, which differ by {rmse_mm:.3f} mm along the normal; register_depth is more certain"
         return Registration(torch.tensor(pose), rmse_mm, fitness, False, f"nothing fits: {share}", unknown)

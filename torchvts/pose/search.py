@@ -15,8 +15,8 @@ STEP_DEG = 5.0
 ENERGY_FLOOR = 0.15
 """Share of a contact's whole energy that is added to the common part's, so that a small common part does not win by chance."""
 
-PEAK_MM = 0.5
-"""Shifts that are nearer to a better one are none of their own: teeth of a key are 1.2 mm apart."""
+SAME_MM = 0.4
+"""Shifts, or poses, that move a contact to so nearly the same place are one: teeth of a key are 1.2 mm apart."""
 
 
 class _Square(NamedTuple):
@@ -47,7 +47,7 @@ def search_plane(source: Grid, target: Grid, most: int = 48, angle: Tensor | Non
     angle = torch.deg2rad(torch.arange(0.0, 360.0, STEP_DEG, dtype=torch.float32)) if angle is None else angle
     moving, fixed = _square(source, rotatable=True), _square(target)
     score = _masked_correlation(moving.channels, fixed.channels, angle)
-    reach = max(1, min(round(PEAK_MM / target.pitch), min(score.shape[1:]) // 2))
+    reach = max(1, min(round(SAME_MM / target.pitch), min(score.shape[1:]) // 2))
     best, turn, shift = _peaks(score, reach, around, most)
     side, size = fixed.channels.shape[1], score.shape[1]
     down, right = torch.where(shift < side, shift, shift - size).double() + 0.5 * (moving.channels.shape[1] - side)

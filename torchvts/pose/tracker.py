@@ -16,18 +16,14 @@ from .direct import equal_poses, likely_poses, symmetries
 from .dots import carried, fused, points_under
 from .follow import TRUSTED_DEG, TRUSTED_MM, Followed, follow, in_common
 from .grids import LEAST_CELLS, DepthFrame, Grids, Surface, Unusable, grids, pitch_by_slopes, surface_of
+from .inverse import LEAST_SLOPE_NOISE
 from .keyframe import KeyframeGraph, make_keyframe
 from .result import Registration
 from .rigid import Array, cross, distance_mm, moved_covariance, orthonormal
-from .uncertainty import LEAST_SLOPE_NOISE
 
-ENOUGH = 0.5
-"""Share of the smaller contact in common below which a new keyframe is taken, and above which an older one is used again; and share
-of the reference's contact that a keyframe must have."""
-
-VAGUER = 2.0
-"""A pose whose variance is so many times the least since the keyframe was taken up makes a new keyframe; a contact of so many times
-its pixels does so too."""
+HALF = 0.5
+"""A keyframe that shows half as much as it could makes room for another one: half of the smaller contact is in common, the variance
+is twice the least since it was taken up, or the contact is twice its own. Half of the reference's contact is no keyframe."""
 
 JUMP_MM = 1.0
 """Motion of the contact between frames, beside the expected one, beyond which a pose is not taken: another one may look alike."""
@@ -207,8 +203,8 @@ class PoseTracker:
         most = self._way[self._active] + variance
         for k in range(self._active):
             share, variance = self._in_common(k, frame, expected)
-            few = frame.touching < VAGUER * self.graph.keyframes[k].grids.touching
-            if few and share > ENOUGH and self._way[k] + variance < most:
+            few = HALF * frame.touching < self.graph.keyframes[k].grids.touching
+            if few and share > HALF and self._way[k] + variance < most:
                 return k
         return None
 
@@ -256,7 +252,7 @@ class PoseTracker:
             if vaguest.free.shape[1] > keyframe.held.shape[1]:
                 message = f"it touches, but too little to show its {', '.join(vaguest.names)}"
                 continue  # what is unknown now would keep a value of long ago
-            if not found.exact and frame.touching < ENOUGH * keyframe.grids.touching:
+            if not found.exact and frame.touching < HALF * keyframe.grids.touching:
                 message = "it touches with a small part, which other parts of the object may look like"
                 continue
             self._symmetries = [inv(found.pose @ chain) @ one.pose @ chain for one in equal if one is not found]
@@ -287,11 +283,11 @@ class PoseTracker:
         if self._carried is not None and self._by_dots is not None:
             pose, covariance = fused(pose, covariance, self._carried, self._by_dots)
         self._poses = [*self._poses[-1:], pose]
-        large = frame.touching > ENOUGH * graph.keyframes[0].grids.touching
-        grown = frame.touching > VAGUER * keyframe.grids.touching
+        large = frame.touching > HALF * graph.keyframes[0].grids.touching
+        grown = HALF * frame.touching > keyframe.grids.touching
         share, variance = in_common(keyframe, frame, found.pose)
         self._least = min(self._least, variance)
-        moved_on, vague = large and share < ENOUGH, large and variance > VAGUER * self._least
+        moved_on, vague = large and share < HALF, large and HALF * variance > self._least
         if (grown or moved_on or vague) and found.free.shape[1] <= keyframe.held.shape[1]:  # else what is unknown now would stay so
             self._take_keyframe(contact, found, variance)
         std_deg, std_mm = math.hypot(found.std_deg, drift_deg), math.hypot(found.std_mm, drift_mm)

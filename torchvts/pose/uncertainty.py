@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from .height_errors import ALIKE_MM
-from .inverse import Sums
+from .inverse import LEAST_SLOPE_NOISE, Sums
 from .rigid import Array
 
 PARTS = 8
@@ -13,9 +13,6 @@ PARTS = 8
 
 UNSEEN = math.sqrt(2.0 / (5 * (PARTS - 1)))
 """Standard deviation, as a share, of the variance that so many parts show in the five motions that slopes show."""
-
-LEAST_SLOPE_NOISE = 1e-3
-"""Slopes of pixels err by so much at least."""
 
 
 def in_parts(places: Array) -> Array:

@@ -39,9 +39,6 @@ REACH = 1.6
 AGREES = 0.3
 """A dot that has moved otherwise than its neighbours by so many spacings is another dot; less where they tell less."""
 
-ROUNDS = 12
-"""Rings of dots that are found one after another where there is no frame before."""
-
 LENGTH = 2.2
 """Of the Gaussian process of motion, in spacings."""
 
@@ -124,7 +121,8 @@ class SkinMotion(nn.Module):
         self.spacing_px = float(distance.topk(2, largest=False).values[:, 1].median())
         self.knows_camera = camera_mm is not None
         x, y, height = (0.0, 0.0, math.inf) if camera_mm is None else check_camera(camera_mm)
-        self.agrees, self.rounds, self.most_px = AGREES, ROUNDS, 0.3 * self.diameter_px
+        self.agrees, self.most_px = AGREES, 0.3 * self.diameter_px
+        self.rounds = math.ceil(math.sqrt(2.0 * len(dots)))  # rings of dots around one in a corner
         self.nearest_mm, self.pedestal, self.depth_share, self.depth_mm = NEAREST_CAMERA_MM, PEDESTAL, DEPTH_SHARE, DEPTH_MM
         self.nugget, self.bend_share, self.floor_px = NUGGET, BEND_SHARE, FLOOR_PX
         middle = 0.5 * dots.new_tensor([self.width - 1.0, self.height - 1.0])

@@ -14,8 +14,6 @@ from .live import TactileFrame
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_RANGES = (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0)
-
 
 class Overlay:
     """Draws a frame: the image with its contact outlined, beside it depth in colour with contour lines, text and a bar beneath.
@@ -96,9 +94,11 @@ class Overlay:
 
 def round_up(range_mm: float, high_mm: float) -> float:
     """The next round range that holds ``high_mm``; ``range_mm`` where it holds it already."""
+    from ..viz import ROUND
+
     while high_mm > range_mm:
         power = 10.0 ** np.floor(np.log10(range_mm) + 1e-9)
-        range_mm = float(power * next(s for s in _RANGES if s > range_mm / power + 1e-6))
+        range_mm = float(power * next(value for value in ROUND if value > range_mm / power + 1e-6))
     return range_mm
 
 

@@ -20,9 +20,6 @@ AXIS_COLOURS = ((230, 60, 50), (60, 200, 80), (60, 90, 240))
 EXAGGERATION = 3.0
 """Heights are so many times as large on the screen."""
 
-MOST_POINTS = 160
-"""Largest number of points of the surface in each direction."""
-
 
 def has_screen() -> bool:
     """Whether a window can be opened: under Linux a screen must be named."""
@@ -156,7 +153,7 @@ class LiveView:
         self.close()
 
     def _log_surface(self, depth: np.ndarray[Any, Any], normal: Tensor) -> None:
-        from ..viz import depth_colors
+        from ..viz import MOST_POINTS, depth_colors
 
         stride = max(1, -(-max(depth.shape) // MOST_POINTS))
         z = depth[::stride, ::stride]

@@ -5,7 +5,7 @@
 
 /* What the residuals depend on beside the pixels; the order is that of residual_limits in inverse.py. */
 typedef struct {
-    double pose[16], x0, y0, pitch, per_slope, per_height, score_slope, score_height, deep, shallow;
+    double pose[16], x0, y0, pitch, per_slope, per_height, score_slope, score_height, shallow;
 } Limits;
 
 #define INLINE static inline __attribute__((always_inline))
@@ -62,7 +62,7 @@ INLINE void compare(const float *points, int64_t stride, int size, const Limits 
     for (int k = 0; k < 12; k++) P[k] = (float)at->pose[k];
     const float per_slope = (float)at->per_slope, per_height = (float)at->per_height; /* 1 / noise^2 */
     const float score_slope = (float)at->score_slope, score_height = (float)at->score_height;
-    const float deep = (float)at->deep, shallow = (float)at->shallow;
+    const float shallow = (float)at->shallow;
     const int whole = (size + LANES - 1) / LANES * LANES;
     const Lanes one = {1.0f, 1.0f, 1.0f, 1.0f, 1.0f, 1.0f, 1.0f, 1.0f};
     float expected[2][BLOCK];
@@ -81,7 +81,7 @@ INLINE void compare(const float *points, int64_t stride, int size, const Limits 
         const Lanes off_z = height - z, off = off_p * off_p + off_q * off_q, high = off_z * off_z;
         const Lanes error = off * score_slope + high * score_height;
         const Ints within = (*(const Lanes *)(b->place + n) > 0.5f) & (z > shallow), inside = within & (mask > 0.999f);
-        const Ints counted = within & (z > deep) & ((mask > 0.999f) | (mask <= 0.001f)), good = inside & (error < 1.0f);
+        const Ints counted = within & ((mask > 0.999f) | (mask <= 0.001f)), good = inside & (error < 1.0f);
         *(Lanes *)(b->bad + n) = WHEN(counted & good, error) + WHEN(counted & ~good, one);
         *(Lanes *)(b->good + n) = WHEN(counted & good, one), *(Lanes *)(b->compared + n) = WHEN(counted, one);
         *(Lanes *)(b->used + n) = WHEN(inside, one);

@@ -148,7 +148,7 @@ def test_reconstruct_begins_with_a_sheet_keeps_the_order_and_says_what_to_do_nex
     done = run_script("reconstruct", unit, *given, "--out", tmp_path / "out")
     said = done.stdout.splitlines()
     assert (
-        said[0] == f"wrote {tmp_path / 'out' / 'sheet.png'}: the first 3 images in one scale"
+        said[0] == f"wrote {tmp_path / 'out' / 'sheet.png'}: the first 3 of 3 images in one scale"
         and (tmp_path / "out/sheet.png").is_file()
     )
     assert [line.partition(":")[0] for line in said[1:4]] == ["2.png", "3.png", "1.png"]

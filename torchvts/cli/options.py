@@ -16,6 +16,7 @@ from ..core.checks import parse_number
 from ..core.containers import open_film
 from ..core.spelling import suggest
 from ..model import Calibration, Sensor, shipped_sensors
+from ..model.summary import NOT_METRIC
 from ..pipeline import MODES
 from ..pose.output_frame import MM_OF
 from ..skin import ContactSettings
@@ -175,6 +176,15 @@ def add_out(parser: argparse._ActionsContainer, text: str) -> None:
 def working(what: str) -> "tqdm[NoReturn]":
     """For a ``with`` block that takes seconds: a line that says what it does, where a person looks on."""
     return tqdm(desc=what, bar_format="{desc} ...", leave=False, disable=None)
+
+
+def ended(metric: bool, wrong: object, step: str = "") -> int:
+    """Print what to do next, and give the exit status: 1 where depth is not metric or something is wrong with the frames."""
+    if not metric:
+        step = f"{NOT_METRIC}, in no known unit: mend what the doubts name, and calibrate again"
+    if step:
+        print(f"next: {step}")
+    return 1 if wrong or not metric else 0
 
 
 def calibrated(background: Tensor, sensor: Sensor, presses: Sequence[Press], force: bool = False) -> Calibration:

@@ -20,7 +20,7 @@ from .calibration import Press
 from .calibration.contacts import INSIDE
 from .core.files import write_atomically
 from .model import Calibration
-from .model.report import PressRow
+from .model.report import COUNTS_LITTLE, PressRow
 from .model.stated_error import error_over_skin, press_next
 from .pipeline import DepthPipeline
 from .skin import DotMotion
@@ -346,7 +346,8 @@ def calibration_figure(calibration: Calibration, presses: Sequence[Press]) -> Fi
     rows = {row["name"]: row for row in calibration.report.get("presses", [])}
     given = [press for press in presses if press.name in rows]
     even = given[:: max(1, -(-len(given) // PRESSES_SHOWN))]
-    shown = sorted({*even, *given}, key=lambda press: (rows[press.name]["weight"] > 0.5, press not in even))[:PRESSES_SHOWN]
+    little = {press for press in given if rows[press.name]["weight"] < COUNTS_LITTLE}
+    shown = sorted({*even, *given}, key=lambda press: (press not in little, press not in even))[:PRESSES_SHOWN]
     doubts = calibration.report.get("doubts") or ["no doubts"]
     text = _wrapped(doubts)
     height, width = calibration.background.shape[1:]
@@ -384,7 +385,7 @@ def calibration_figure(calibration: Calibration, presses: Sequence[Press]) -> Fi
         image.imshow(_picture(press.image))
         _circle(image, row)
         name = press.name if len(press.name) <= NAME_SHOWN else f"...{press.name[-NAME_SHOWN:]}"
-        counts = "" if row["weight"] > 0.5 else f", counts {row['weight']:.2f}"
+        counts = "" if row["weight"] >= COUNTS_LITTLE else f", counts {row['weight']:.2f}"
         image.set_title(name + (counts if row["used"] else ", left out"), fontsize=9)
         if "center_px" not in row:
             continue

@@ -97,6 +97,16 @@ def test_of_many_left_out_a_few_are_printed():
     assert lines[0] == "left out: press 0: too wide" and lines[-1] == "left out: 7 more" and len(lines) == SHOWN + 1
 
 
+def test_presses_that_count_little_are_named_with_their_weights(mini_by_prior):
+    weights = {"a": 1.0, "b": 0.31, "c": 0.04, "d": 0.0}
+    rows = [{"name": name, "used": weight > 0.0, "weight": weight, "reason": ""} for name, weight in weights.items()]
+    unit = dataclasses.replace(mini_by_prior, report={"model": "response", "source": "presses", "presses": rows})
+    named = [line for line in str(unit).splitlines() if line.startswith("counts little")]
+    assert len(named) == 1 and named[0].endswith(": c 0.04, b 0.31")
+    rows[1]["reason"] = rows[2]["reason"] = "counts 0.31 of a press: by the others the ball seems wider"  # said as a doubt
+    assert "counts little" not in str(unit)
+
+
 @pytest.fixture(scope="module")
 def rig(ring):
     """Sensor, lights, background and an image of a press."""

@@ -47,6 +47,7 @@ def test_the_overview_names_every_command(capsys):
         (["reconstruct", "a", "b"], "the following arguments are required: --out"),
         (["reconstruct", "gelsight_mini", "b", "--out", "c"], "torchvts calibrate background.png --sensor gelsight_mini"),
         (["reconstruct", "nnmodel.pth", "b", "--out", "c"], "a network: give it by --network"),
+        (["reconstruct", "a.png", "b.safetensors", "--out", "c"], "calibration first, then what it reads, got a.png before b.safe"),
         (["reconstruct", "a.png", "--out", "c"], "name both, or --sensor to calibrate"),
         (["calibrate", "a.png", "--sensor", "gelsight-mini", "--out", "a.safetensors"], "did you mean 'gelsight_mini'?"),
         (["calibrate", "a.png"], "expected either --sensor or --mm-per-pixel"),
@@ -165,6 +166,11 @@ def test_reconstruct_begins_with_a_sheet_keeps_the_order_and_says_what_to_do_nex
     assert said[-1].startswith("next: ")
     again = run_script("reconstruct", unit, *given, "--out", tmp_path / "out")
     assert "in one scale" not in again.stdout and again.returncode == done.returncode
+
+
+def test_a_source_that_is_not_there_is_named(unit, run_script, tmp_path):
+    done = run_script("reconstruct", unit, tmp_path / "none.png", "--out", tmp_path / "out")
+    assert done.returncode == 2 and done.stderr == f"torchvts: error: {tmp_path / 'none.png'}: no such file or folder\n"
 
 
 @pytest.mark.parametrize("command", ["stream", "reconstruct", "pose", "track"])

@@ -144,6 +144,7 @@ TRIGGERS = {
     "noise": gallery("noise", 0.02),
     "led_failed": gallery("dead lights", 1.0),
     "no_picture": changed(lambda image: torch.full_like(image, 0.5)),
+    "no_picture, all black": changed(lambda image: torch.zeros_like(image)),
     "other_view": mirrored,
     "channels_swapped": changed(lambda image: image[[2, 1, 0]]),
     "channels_swapped, at calibration too": gallery("channel order", 1.0),

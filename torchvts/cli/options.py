@@ -46,7 +46,8 @@ def split_files(arguments: argparse.Namespace) -> tuple[Sensor | Calibration, li
     """The unit and the inputs that the arguments of :func:`add_unit` name.
 
     Raises:
-        UsageError: a calibration beside ``--sensor``, neither of both, no input, or what calibrates beside a calibration.
+        UsageError: a calibration beside ``--sensor`` or behind the inputs, neither of both, no input, or what calibrates beside a
+            calibration.
     """
     first, *inputs = arguments.files
     if arguments.sensor is not None:
@@ -58,6 +59,9 @@ def split_files(arguments: argparse.Namespace) -> tuple[Sensor | Calibration, li
     if not inputs:
         open_film(Path(first))  # a container of several recordings: names them
         raise UsageError(f"expected a calibration file and an input, got {first}: name both, or --sensor to calibrate")
+    late = [name for name in inputs if name.endswith(".safetensors")]
+    if late and not first.endswith(".safetensors"):
+        raise UsageError(f"expected the calibration first, then what it reads, got {first} before {late[0]}")
     return load_calibration(Path(first)), inputs
 
 

@@ -126,7 +126,8 @@ def next_step(calibration: Path, inputs: list[Path], arguments: argparse.Namespa
         source = inputs[0] if len(inputs) == 1 else "INPUT"
         return f"torchvts diagnose {calibration} {source} says what is wrong, the docs/diagnose.md page what to do"
     if arguments.format in ("npz", "video-npz"):
-        return f"vts.read_result(path) reads a file of {arguments.out} in Python; --cloud ply adds the contact as points"
+        points = "; --cloud ply adds the contact as points" if arguments.cloud == "none" else ""
+        return f"vts.read_result(path) reads a file of {arguments.out} in Python{points}"
     return f"{arguments.out / 'summary.json'} says what the files are"
 
 

@@ -18,7 +18,9 @@ from lab.drawn_sensors import drawn_sensor
 from lab.gallery import CORRUPTIONS, undisturbed
 from lab.training import Training
 from torchvts import scenes
+from torchvts.cli.reconstruct import diagnose_some
 from torchvts.core.blur import blur, gaussian_weights
+from torchvts.dataset import RunReport
 from torchvts.diagnose import Diagnosis, Finding
 from torchvts.diagnose.checks import CHECKS
 from torchvts.model.response_field import ResponseModel
@@ -391,6 +393,16 @@ def test_what_most_frames_have_stands_above_a_worse_finding_of_one(tmp_path, run
     first, worst, *_ = run_script("diagnose", unit, folder).stdout.splitlines()
     assert first == "9 frames: 0 without a warning or a fault"
     assert worst.startswith("warning in 8 of 9, such as 0.png: ") and worst.endswith("[noise]")
+
+
+def test_reconstruct_gives_a_finding_as_the_worst_of_its_frames(tmp_path):
+    """By a warning of the first frame the fault of the second went unseen, and the exit status was 0."""
+    case = undisturbed(2)
+    for k, noise_std in enumerate((0.012, 0.1)):
+        noise = noise_std * torch.randn(case.image[0].shape, generator=torch.Generator().manual_seed(k))
+        vts.write_image(tmp_path / f"{k}.png", (case.image[0] + noise).clamp(0.0, 1.0))
+    findings = diagnose_some(case.calibration, [tmp_path], RunReport(0, 2, 0, [], 0.0), 1)
+    assert [(name, finding.severity) for name, finding in findings if finding.name == "noise"] == [("1.png and 1 more", "fault")]
 
 
 def test_the_command_cuts_raw_frames_as_reconstruct_does(tmp_path, run_script):

@@ -22,7 +22,7 @@ from ..core.arrays import Array
 from ..core.files import make_folder
 from ..core.recordings import is_film
 from ..dataset import CLOUD_FORMATS, FORMATS, PICTURES_UP_TO, RunReport, list_items, reconstruct_dataset
-from ..diagnose import Finding, diagnose
+from ..diagnose import SEVERITIES, Finding, diagnose
 from ..model import Calibration, Sensor
 from ..model.report import warnings_of
 from ..model.summary import NOT_METRIC, SHOWN, doubts_of
@@ -183,7 +183,7 @@ def print_report(report: RunReport, out: Path, metric: bool) -> None:
 def diagnose_some(unit: Calibration, inputs: list[Path], report: RunReport, every: int) -> list[tuple[str, Finding]]:
     """What is wrong with :data:`DIAGNOSED` images, and the first frame of each video; frames that were left out are not asked.
 
-    A finding is given once, with its first frame and how many more have it. Of a frame in doubt only faults are given.
+    A finding is given once, as the worst frame has it, and how many more have it. Of a frame in doubt only faults are given.
     """
     left_out, doubted = ({name for name, _ in rows} for rows in (report.failed, report.doubted))
     items = list(list_items(tuple(inputs), every))
@@ -202,4 +202,6 @@ def diagnose_some(unit: Calibration, inputs: list[Path], report: RunReport, ever
         for finding in diagnose(None, image, unit):
             if finding.severity == "fault" or (finding.severity == "warning" and name not in doubted):
                 found.setdefault(finding.name, []).append((name, finding))
-    return [(same[0][0] + (f" and {len(same) - 1} more" if len(same) > 1 else ""), same[0][1]) for same in found.values()]
+    worst = (min(same, key=lambda pair: SEVERITIES.index(pair[1].severity)) for same in found.values())
+    more = (f" and {len(same) - 1} more" if len(same) > 1 else "" for same in found.values())
+    return [(name + others, finding) for (name, finding), others in zip(worst, more)]

@@ -25,7 +25,7 @@ from ..dataset import CLOUD_FORMATS, FORMATS, PICTURES_UP_TO, RunReport, list_it
 from ..diagnose import SEVERITIES, Finding, diagnose
 from ..model import Calibration, Sensor
 from ..model.report import warnings_of
-from ..model.summary import NOT_METRIC, SHOWN, doubts_of
+from ..model.summary import SHOWN, doubts_of
 from ..stream import Recording, frames, read_background, read_press_images
 from ..viz import NAME_SHOWN, save_figure, sheet_figure
 from .options import add_length_unit, add_out, add_pipeline, add_unit, calibrated, contact_of, ended, split_files, working
@@ -148,9 +148,7 @@ def calibrate_first(arguments: argparse.Namespace, inputs: list[Path], unit: Sen
 
 
 def print_unit(unit: Calibration) -> None:
-    """Print why not to trust a calibration that was given."""
-    if not unit.metric:
-        print(NOT_METRIC)
+    """Print why not to trust a calibration that was given; that depth is not metric is the last line."""
     if warnings_of(unit.report):
         print(*doubts_of(unit.report), sep="\n")
 

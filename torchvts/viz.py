@@ -20,7 +20,7 @@ from .calibration import Press
 from .calibration.contacts import INSIDE
 from .core.files import write_atomically
 from .model import Calibration
-from .model.report import PressRow
+from .model.report import COUNTS_LITTLE, PressRow
 from .model.stated_error import error_over_skin, press_next
 from .pipeline import DepthPipeline
 from .skin import DotMotion
@@ -119,7 +119,7 @@ def depth_figure(
     title += "" if metric else ", NOT METRIC"
     ratio = depth.shape[0] / depth.shape[1]
     wide = 2.45 if ratio < 1.0 else 2.0
-    text = "\n".join("\n".join(textwrap.wrap(doubt, 152)) for doubt in doubts)
+    text = _wrapped(doubts)
     above = (0.62 if title else 0.32) + (0.05 + 0.16 * (text.count("\n") + 1) if text else 0.0)
     high, left = wide * ratio, 0.6 + wide + 0.5
     lower, size = 0.5, (left + wide + 0.95 + 3.4, high + above + 0.5)
@@ -261,31 +261,47 @@ def draw_surface(axes: Any, depth: Array, mm_per_pixel: float, exaggeration: flo
     _space_labels(axes)
 
 
-def sheet_figure(frames: Sequence[tuple[float | str, Array]], mm_per_pixel: float, metric: bool = True) -> Figure:
+def sheet_figure(
+    frames: Sequence[tuple[float | str, Array, str]],
+    mm_per_pixel: float,
+    title: str = "",
+    metric: bool = True,
+    doubts: Sequence[str] = (),
+) -> Figure:
     """Depth of a few frames in one range of colours, with contour lines and one colour bar.
 
     Args:
-        frames: time, s, or name, and depth (H, W), mm, of each.
+        frames: time, s, or name, depth (H, W), mm, and why it is in doubt ("" for nothing), of each.
         mm_per_pixel: pixel pitch, mm.
-        metric: whether depth is in mm; otherwise the bar says that it is not.
+        title: text above the panels, as which of how many frames they are.
+        metric: whether depth is in mm; otherwise the title and the bar say that it is not.
+        doubts: why not to trust any of them, a sentence each, below the panels; the first doubt of a frame follows.
     """
+    names = [name if isinstance(name, str) else f"{name:.2f} s" for name, _, _ in frames]
+    in_doubt = [f"{name} IN DOUBT: {doubt}" for name, (_, _, doubt) in zip(names, frames, strict=True) if doubt]
+    text = _wrapped([*doubts, *in_doubt[:1]], 140)
     columns = min(3, len(frames))
     rows = -(-len(frames) // columns)
     height, width = frames[0][1].shape
-    figure = new_figure(9.5, 0.5 + rows * (0.3 + 7.5 / columns * height / width))
+    lines = 0.17 * (text.count("\n") + 1) if text else 0.0
+    figure = new_figure(9.5, 0.5 + 0.3 * bool(title) + lines + rows * (0.3 + 7.5 / columns * height / width))
     axes = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
-    span = depth_range(*(depth for _, depth in frames))
+    span = depth_range(*(depth for _, depth, _ in frames))
     colors, norm = depth_colors(*span)
     step = _round_step(span[1] - span[0])
-    for k, ((title, depth), panel) in enumerate(zip(frames, axes.flat)):
+    for k, ((_, depth, doubt), panel) in enumerate(zip(frames, axes.flat)):
         picture = panel.imshow(depth, cmap=colors, norm=norm, extent=_extent(depth, mm_per_pixel))
         _draw_lines(panel, depth, mm_per_pixel, step, colors, norm)
-        panel.set_title(title if isinstance(title, str) else f"{title:.2f} s", fontsize=10)
+        panel.set_title(names[k] + (", IN DOUBT" if doubt else ""), fontsize=10, color=DOUBT if doubt else "black")
         panel.set(xlabel="x, mm" if k >= len(frames) - columns else "", ylabel="" if k % columns else "y, mm (down)")
     for panel in axes.flat[len(frames) :]:
         panel.remove()
     unit = "mm" if metric else "mm, NOT METRIC"
     figure.colorbar(picture, ax=axes.ravel()[: len(frames)], aspect=30, shrink=0.9, label=f"depth, {unit}; a line every {step:g}")
+    if title:
+        figure.suptitle(title + ("" if metric else ", NOT METRIC"), fontsize=11)
+    if text:
+        figure.supxlabel(text, fontsize=8, color=DOUBT, x=0.01, ha="left")
     return figure
 
 
@@ -333,9 +349,10 @@ def calibration_figure(calibration: Calibration, presses: Sequence[Press]) -> Fi
     rows = {row["name"]: row for row in calibration.report.get("presses", [])}
     given = [press for press in presses if press.name in rows]
     even = given[:: max(1, -(-len(given) // PRESSES_SHOWN))]
-    shown = sorted({*even, *given}, key=lambda press: (rows[press.name]["weight"] > 0.5, press not in even))[:PRESSES_SHOWN]
+    little = {press for press in given if rows[press.name]["weight"] < COUNTS_LITTLE}
+    shown = sorted({*even, *given}, key=lambda press: (press not in little, press not in even))[:PRESSES_SHOWN]
     doubts = calibration.report.get("doubts") or ["no doubts"]
-    text = "\n".join("\n".join(textwrap.wrap(doubt, 150, subsequent_indent="    ")) for doubt in doubts)
+    text = _wrapped(doubts)
     height, width = calibration.background.shape[1:]
     lines, side = -(-len(shown) // 2), 2.35 * min(1.4, height / width)
     figure = new_figure(10.4, (lines + 1) * (side + 0.35) + 0.7 + 0.17 * (text.count("\n") + 1))
@@ -371,7 +388,7 @@ def calibration_figure(calibration: Calibration, presses: Sequence[Press]) -> Fi
         image.imshow(_picture(press.image))
         _circle(image, row)
         name = press.name if len(press.name) <= NAME_SHOWN else f"...{press.name[-NAME_SHOWN:]}"
-        counts = "" if row["weight"] > 0.5 else f", counts {row['weight']:.2f}"
+        counts = "" if row["weight"] >= COUNTS_LITTLE else f", counts {row['weight']:.2f}"
         image.set_title(name + (counts if row["used"] else ", left out"), fontsize=9)
         if "center_px" not in row:
             continue
@@ -427,6 +444,11 @@ def save_figure(figure: Figure, path: str | Path) -> None:
     """Write a figure in the format of the suffix; an interrupted write leaves no file."""
     with write_atomically(path) as temporary:
         figure.savefig(str(temporary))
+
+
+def _wrapped(doubts: Sequence[str], width: int = 150) -> str:
+    """Doubts as lines of so many characters, each doubt from its own line on."""
+    return "\n".join("\n".join(textwrap.wrap(doubt, width, subsequent_indent="    ")) for doubt in doubts)
 
 
 def _plane(tensor: Tensor) -> Array:

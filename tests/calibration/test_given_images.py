@@ -170,3 +170,20 @@ def test_real_presses_are_kept_and_mistakes_refused(data, name):
         with pytest.raises(ValueError, match=f"^presses: .*{message}"):
             sort_presses(background, changed(presses[:3], change))
     assert "was a press given as the background?" in beside_presses(presses[4].image, presses[:4] + presses[5:])
+
+
+@pytest.mark.parametrize("width", [0.3, 0.5, 0.7])
+def test_a_black_level_that_has_moved_is_another_light_however_much_of_a_channel_it_cuts_off(given, width):
+    """Cells that are black in background and press alike hid it: balls were found at the edge of the light, all in one place."""
+    background, presses = given
+    fall = (torch.linspace(0.0, 1.0, background.shape[2]) - width) / (1.0 - width)
+
+    def camera(image, black):
+        return torch.cat((image[:2], (image[2:] * fall - black).clamp_min(0.0)))
+
+    dark = camera(background, 0.0)
+    assert float((dark[2] == 0.0).float().mean()) == pytest.approx(width, abs=0.02)
+    same, moved = (changed(presses, lambda image, black=black: camera(image, black)) for black in (0.0, 0.1))
+    assert len(sort_presses(dark, same)[0]) == len(presses)
+    with pytest.raises(ValueError, match=r"presses: expected the light of the background, got .* that differ from it by"):
+        sort_presses(dark, moved)

@@ -47,6 +47,7 @@ def test_the_overview_names_every_command(capsys):
         (["reconstruct", "a", "b"], "the following arguments are required: --out"),
         (["reconstruct", "gelsight_mini", "b", "--out", "c"], "torchvts calibrate background.png --sensor gelsight_mini"),
         (["reconstruct", "nnmodel.pth", "b", "--out", "c"], "a network: give it by --network"),
+        (["reconstruct", "a.png", "b.safetensors", "--out", "c"], "calibration first, then what it reads, got a.png before b.safe"),
         (["reconstruct", "a.png", "--out", "c"], "name both, or --sensor to calibrate"),
         (["calibrate", "a.png", "--sensor", "gelsight-mini", "--out", "a.safetensors"], "did you mean 'gelsight_mini'?"),
         (["calibrate", "a.png"], "expected either --sensor or --mm-per-pixel"),
@@ -95,6 +96,16 @@ def test_a_refusal_is_one_line_and_a_bug_has_a_traceback_and_a_status_of_its_own
 def test_of_many_left_out_a_few_are_printed():
     lines = list(left_out("press", [(str(k), "too wide") for k in range(SHOWN + 7)]))
     assert lines[0] == "left out: press 0: too wide" and lines[-1] == "left out: 7 more" and len(lines) == SHOWN + 1
+
+
+def test_presses_that_count_little_are_named_with_their_weights(mini_by_prior):
+    weights = {"a": 1.0, "b": 0.31, "c": 0.04, "d": 0.0}
+    rows = [{"name": name, "used": weight > 0.0, "weight": weight, "reason": ""} for name, weight in weights.items()]
+    unit = dataclasses.replace(mini_by_prior, report={"model": "response", "source": "presses", "presses": rows})
+    named = [line for line in str(unit).splitlines() if line.startswith("counts little")]
+    assert len(named) == 1 and named[0].endswith(": c 0.04, b 0.31")
+    rows[1]["reason"] = rows[2]["reason"] = "counts 0.31 of a press: by the others the ball seems wider"  # said as a doubt
+    assert "counts little" not in str(unit)
 
 
 @pytest.fixture(scope="module")
@@ -148,13 +159,18 @@ def test_reconstruct_begins_with_a_sheet_keeps_the_order_and_says_what_to_do_nex
     done = run_script("reconstruct", unit, *given, "--out", tmp_path / "out")
     said = done.stdout.splitlines()
     assert (
-        said[0] == f"wrote {tmp_path / 'out' / 'sheet.png'}: the first 3 images in one scale"
+        said[0] == f"wrote {tmp_path / 'out' / 'sheet.png'}: the first 3 of 3 images in one scale"
         and (tmp_path / "out/sheet.png").is_file()
     )
     assert [line.partition(":")[0] for line in said[1:4]] == ["2.png", "3.png", "1.png"]
     assert said[-1].startswith("next: ")
     again = run_script("reconstruct", unit, *given, "--out", tmp_path / "out")
     assert "in one scale" not in again.stdout and again.returncode == done.returncode
+
+
+def test_a_source_that_is_not_there_is_named(unit, run_script, tmp_path):
+    done = run_script("reconstruct", unit, tmp_path / "none.png", "--out", tmp_path / "out")
+    assert done.returncode == 2 and done.stderr == f"torchvts: error: {tmp_path / 'none.png'}: no such file or folder\n"
 
 
 @pytest.mark.parametrize("command", ["stream", "reconstruct", "pose", "track"])

@@ -18,7 +18,9 @@ from lab import sets
 from lab.gallery import CORRUPTIONS, undisturbed
 from lab.training import Training
 from torchvts import scenes
+from torchvts.cli.reconstruct import diagnose_some
 from torchvts.core.blur import blur, gaussian_weights
+from torchvts.dataset import RunReport
 from torchvts.diagnose import Diagnosis, Finding
 from torchvts.diagnose.checks import CHECKS
 from torchvts.model.response_field import ResponseModel
@@ -145,6 +147,7 @@ TRIGGERS = {
     "noise": gallery("noise", 0.02),
     "led_failed": gallery("dead lights", 1.0),
     "no_picture": changed(lambda image: torch.full_like(image, 0.5)),
+    "no_picture, all black": changed(lambda image: torch.zeros_like(image)),
     "other_view": mirrored,
     "channels_swapped": changed(lambda image: image[[2, 1, 0]]),
     "channels_swapped, at calibration too": gallery("channel order", 1.0),
@@ -369,13 +372,38 @@ def test_the_command_sums_up_a_folder(tmp_path, run_script):
     done = run_script("diagnose", unit, folder)
     first, *rows, last = done.stdout.splitlines()
     assert done.returncode == 1 and first == "4 frames: 1 without a warning or a fault", done.stderr
-    assert rows[0].startswith("fault: in 2 of 4, such as day/1.png: ") and rows[0].endswith("[channels_swapped]")
-    assert any(row.startswith("fault: in 1 of 4, such as damaged.png: ") and row.endswith("[unreadable]") for row in rows)
+    assert rows[0].startswith("fault in 2 of 4, such as day/1.png: ") and rows[0].endswith("[channels_swapped]")
+    assert any(row.startswith("fault in 1 of 4, such as damaged.png: ") and row.endswith("[unreadable]") for row in rows)
     assert last.startswith("next: ")
     found = json.loads(run_script("diagnose", unit, folder, "--json").stdout)
     assert (found["ok"], found["frames"]) == (False, 4) and found["findings"][0]["frames"] == ["day/1.png", "day/2.png"]
+    assert found["findings"][0]["severities"] == {"fault": 2}
     (tmp_path / "empty").mkdir()
     assert "expected images or videos, got none" in run_script("diagnose", unit, tmp_path / "empty").stderr
+
+
+def test_what_most_frames_have_stands_above_a_worse_finding_of_one(tmp_path, run_script):
+    case = undisturbed(2)
+    unit, folder = tmp_path / "unit.safetensors", tmp_path / "frames"
+    case.calibration.save(unit)
+    folder.mkdir()
+    (folder / "damaged.png").write_bytes(b"no image")
+    rough = (case.image[0] + 0.012 * torch.randn(case.image[0].shape, generator=torch.Generator().manual_seed(0))).clamp(0.0, 1.0)
+    for k in range(8):
+        vts.write_image(folder / f"{k}.png", rough)
+    first, worst, *_ = run_script("diagnose", unit, folder).stdout.splitlines()
+    assert first == "9 frames: 0 without a warning or a fault"
+    assert worst.startswith("warning in 8 of 9, such as 0.png: ") and worst.endswith("[noise]")
+
+
+def test_reconstruct_gives_a_finding_as_the_worst_of_its_frames(tmp_path):
+    """By a warning of the first frame the fault of the second went unseen, and the exit status was 0."""
+    case = undisturbed(2)
+    for k, noise_std in enumerate((0.012, 0.1)):
+        noise = noise_std * torch.randn(case.image[0].shape, generator=torch.Generator().manual_seed(k))
+        vts.write_image(tmp_path / f"{k}.png", (case.image[0] + noise).clamp(0.0, 1.0))
+    findings = diagnose_some(case.calibration, [tmp_path], RunReport(0, 2, 0, [], 0.0), 1)
+    assert [(name, finding.severity) for name, finding in findings if finding.name == "noise"] == [("1.png and 1 more", "fault")]
 
 
 def test_the_command_cuts_raw_frames_as_reconstruct_does(tmp_path, run_script):

@@ -270,6 +270,17 @@ class Restless(NormalModel):
         return normal
 
 
+@pytest.mark.filterwarnings("ignore::torch.jit.TracerWarning", "ignore:.torch.jit.trace:DeprecationWarning")
+@pytest.mark.parametrize("mode", ["fast", "precise"])
+def test_a_traced_response_field_gives_the_same_depth_at_once(mode, mini_by_prior, mini_presses):
+    """It ended in an internal error of PyTorch, by an optional buffer, then in tables that the first call alone made."""
+    pipe = vts.DepthPipeline.from_calibration(mini_by_prior, mode)
+    image, other = (mini_presses[1][k].image[None] for k in (0, 7))
+    traced = torch.jit.trace(pipe, other)
+    depth, expected = traced(image)[0], pipe(image).depth_mm
+    assert expected.max() > 0.1 and (depth - expected).abs().max() < 1e-3  # the choices of the other image are kept
+
+
 @pytest.mark.parametrize("passes", [1, 2, 8])
 def test_precise_solves_as_often_as_the_model_says(mixed, small_sensor, passes):
     lights, frames = mixed

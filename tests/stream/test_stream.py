@@ -290,12 +290,11 @@ def test_both_scripts_give_the_same_depth_for_a_video(unit, run_stream, run_scri
     sensor, saved = ("--sensor", tmp_path / "rig.yaml"), tmp_path / "unit.safetensors"
     options = ("--out", tmp_path / "stream", "--video", "none", "--save-calibration", saved)
     done = run_stream(video, *sensor, *options)
-    assert done.returncode == 0, done.stderr
     by_sensor = run_script("reconstruct", video, *sensor, "--out", tmp_path / "sensor", "--no-pictures")
     by_file = run_script("reconstruct", saved, video, "--out", tmp_path / "file", "--no-pictures")
     own = run_script("calibrate", video, *sensor, "--out", tmp_path / "own.safetensors")
-    statuses = (by_sensor.returncode, by_file.returncode, own.returncode)
-    assert statuses == (0, 0, 1), by_sensor.stderr + by_file.stderr + own.stderr  # lights that are the sensor file's: not metric
+    for command in (done, by_sensor, by_file, own):  # lights that are the sensor file's
+        assert command.returncode == 1 and command.stdout.splitlines()[-1].startswith("next: depth is NOT METRIC"), command.stderr
     assert "first frames not used" not in by_file.stdout + by_sensor.stdout
     assert saved.read_bytes() == (tmp_path / "own.safetensors").read_bytes()
     streamed = [row.split(",") for row in (tmp_path / "stream" / "frames.csv").read_text().splitlines()[1:]]
@@ -528,7 +527,9 @@ def test_a_sheet_shows_six_frames_in_contact_in_one_range(small_press):
         output = vts.DepthOutput(scene.depth_mm, scene.gradient, scene.normal, contact, contact)
         sheet.add(streams.TactileFrame(number, number / 30.0, torch.zeros(3, 120, 160), output))
     assert len(sheet._kept) <= 48
-    *panels, bar = sheet.figure().axes
+    figure = sheet.figure()
+    *panels, bar = figure.axes
+    assert figure.get_suptitle() == "6 of 100 frames in contact, NOT METRIC"
     assert len(panels) == 6 and "NOT METRIC" in bar.get_ylabel()
     limits = {panel.get_images()[0].get_clim() for panel in panels}
     assert len(limits) == 1 and limits.pop() == pytest.approx((0.0, 0.2 + 0.004 * 199), abs=0.05)

@@ -55,10 +55,19 @@ def test_panels_that_are_compared_share_their_range():
 
 @pytest.mark.parametrize("count", [1, 2, 4])
 def test_a_sheet_of_few_frames_has_no_empty_panel(count):
-    frames = [(0.1 * k, frame().numpy() * (k + 1)) for k in range(count)]
+    frames = [(0.1 * k, frame().numpy() * (k + 1), "") for k in range(count)]
     figure = viz.sheet_figure(frames, PITCH)
     figure.draw_without_rendering()
     assert len(figure.axes) == count + 1 and all(axes.get_images() for axes in figure.axes[:count])
+
+
+def test_a_sheet_says_what_is_in_doubt_and_of_how_many_frames_it_is():
+    frames = [("a", frame().numpy(), ""), ("b", frame().numpy(), "too dark"), ("c", frame().numpy(), "too bright")]
+    figure = viz.sheet_figure(frames, PITCH, "3 of 40 images", metric=False, doubts=["one ball only"])
+    titles = [(axes.get_title(), axes.title.get_color() == viz.DOUBT) for axes in figure.axes[:3]]
+    assert titles == [("a", False), ("b, IN DOUBT", True), ("c, IN DOUBT", True)]
+    assert figure.get_suptitle() == "3 of 40 images, NOT METRIC"
+    assert figure.get_supxlabel() == "one ball only\nb IN DOUBT: too dark"
 
 
 def test_a_pose_is_shown_before_and_after_at_one_scale():

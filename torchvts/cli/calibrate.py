@@ -29,7 +29,7 @@ from ..model.summary import summary_of
 from ..stream import StageClock, frames, open_source, read_background, read_press_images
 from ..stream.numbered import SourceFrames
 from .guide import Guide, Session, Watch, draw
-from .options import add_background_frames, add_press, add_sensor, calibrated, load_sensor, read_folder
+from .options import add_background_frames, add_press, add_sensor, calibrated, ended, load_sensor, read_folder
 from .parser import UsageError
 from .source import add_camera_settings, play, settings_of
 
@@ -116,11 +116,8 @@ def write(calibration: Calibration, presses: Sequence[Press], arguments: argpars
     draw(calibration, check_presses(presses, calibration.sensor), picture)
     print(summary_of(calibration, arguments.candidates))
     print(f"wrote {arguments.out} ({arguments.out.stat().st_size / 1000:.0f} kB), and {picture}: what it was made of")
-    if not calibration.metric:
-        print("next: mend what the doubts name, and calibrate again: until then depth is in no known unit")
-        return 1
-    print(f"next: torchvts reconstruct {arguments.out} IMAGE --out FOLDER, or torchvts view {arguments.out} 0 for a camera, live")
-    return 0
+    step = f"torchvts reconstruct {arguments.out} IMAGE --out FOLDER, or torchvts view {arguments.out} 0 for a camera, live"
+    return ended(calibration.metric, False, step)
 
 
 def check_target_of(out: Path) -> None:

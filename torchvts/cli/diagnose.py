@@ -1,6 +1,7 @@
 """Find what is wrong with frames or with the calibration for them; docs/diagnose.md explains every finding.
 
-IMAGE is one frame, or a folder, a video or a container of them: then it is said which finding how many of them have.
+IMAGE is one frame, or a folder, a video or a container of them: then it is said how many frames have each finding, first the one
+that costs most over all of them.
 Exit status 1 where there is a warning or a fault, 0 where there is none.
 
 examples:
@@ -12,6 +13,7 @@ examples:
 import argparse
 import dataclasses
 import json
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +25,7 @@ from ..core.files import read_image, rgb_from_bgr
 from ..core.recordings import count_frames, is_film, raw_frames
 from ..dataset import list_items
 from ..diagnose import SEVERITIES, Finding, diagnose
+from ..diagnose.findings import COST_DEG
 from ..model import Calibration
 from ..stream import read_background
 from .options import load_calibration
@@ -76,7 +79,7 @@ def cut(image: Tensor, calibration: Calibration) -> Tensor:
 
 
 def of_recording(arguments: argparse.Namespace, background: Tensor | None, calibration: Calibration) -> int:
-    """Diagnose the frames of a recording, and print which finding how many of them have, the worst first."""
+    """Diagnose the frames of a recording, and print how many of them have each finding, first the one that costs most over all."""
     items = list(list_items(arguments.image))
     total = sum(count_frames(item.file) if item.is_film else 1 for item in items)
     if total == 0:
@@ -99,24 +102,24 @@ def of_recording(arguments: argparse.Namespace, background: Tensor | None, calib
         for finding in findings:
             found.setdefault(finding.name, []).append((name, finding))
     rows = [summed(same) for same in found.values()]
-    rows.sort(key=lambda row: (SEVERITIES.index(row["severity"]), -len(row["frames"])))
+    rows.sort(key=lambda row: (sum(COST_DEG[name] * n for name, n in row["severities"].items()), len(row["frames"])), reverse=True)
     if arguments.json:
         print(json.dumps({"ok": clean == count, "frames": count, "of": total, "findings": rows}, indent=1))
         return 0 if clean == count else 1
     looked = f"{count} frames" if every == 1 else f"{count} of {total} frames"
     print(f"{looked}: {clean} without a warning or a fault")
     for row in rows:
-        print(
-            f"{row['severity']}: in {len(row['frames'])} of {count}, such as {row['frames'][0]}: {row['message']} [{row['name']}]"
-        )
+        shares = ", ".join(f"{severity} in {n}" for severity, n in row["severities"].items())
+        print(f"{shares} of {count}, such as {row['frames'][0]}: {row['message']} [{row['name']}]")
     print(next_step(arguments.calibration, arguments.image, clean == count))
     return 0 if clean == count else 1
 
 
 def summed(same: list[tuple[str, Finding]]) -> dict[str, Any]:
-    """One finding of several frames: the first of the worst, and the names of all, the worst first."""
+    """One finding of several frames: the first of the worst, the names of all, the worst first, and how many of each severity."""
     ranked = sorted(same, key=lambda pair: SEVERITIES.index(pair[1].severity))
-    return {**dataclasses.asdict(ranked[0][1]), "frames": [name for name, _ in ranked]}
+    severities = Counter(finding.severity for _, finding in ranked)
+    return {**dataclasses.asdict(ranked[0][1]), "frames": [name for name, _ in ranked], "severities": dict(severities)}
 
 
 def next_step(unit: Path, image: Path, ok: bool) -> str:

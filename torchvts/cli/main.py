@@ -61,8 +61,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     Args:
         argv: the words after ``torchvts``; None takes those of the process.
     Returns:
-        The exit status: 0; 1 where frames were left out or in doubt, or a fault was found; 2 for a wrong request or input; 70 for
-        a bug; 130 after Ctrl-C.
+        The exit status: 0; 1 where something is wrong with the images (:data:`FAILED`); 2 for a wrong request or input; 70 for a
+        bug; 130 after Ctrl-C.
     Example:
         >>> main(["--version"])  # doctest: +ELLIPSIS
         torchvts ...

@@ -16,6 +16,7 @@ from ..core.checks import parse_number
 from ..core.containers import open_film
 from ..core.spelling import suggest
 from ..model import Calibration, Sensor, shipped_sensors
+from ..model.summary import NOT_METRIC
 from ..pipeline import MODES
 from ..pose.output_frame import MM_OF
 from ..skin import ContactSettings
@@ -45,7 +46,8 @@ def split_files(arguments: argparse.Namespace) -> tuple[Sensor | Calibration, li
     """The unit and the inputs that the arguments of :func:`add_unit` name.
 
     Raises:
-        UsageError: a calibration beside ``--sensor``, neither of both, no input, or what calibrates beside a calibration.
+        UsageError: a calibration beside ``--sensor`` or behind the inputs, neither of both, no input, or what calibrates beside a
+            calibration.
     """
     first, *inputs = arguments.files
     if arguments.sensor is not None:
@@ -57,6 +59,9 @@ def split_files(arguments: argparse.Namespace) -> tuple[Sensor | Calibration, li
     if not inputs:
         open_film(Path(first))  # a container of several recordings: names them
         raise UsageError(f"expected a calibration file and an input, got {first}: name both, or --sensor to calibrate")
+    late = [name for name in inputs if name.endswith(".safetensors")]
+    if late and not first.endswith(".safetensors"):
+        raise UsageError(f"expected the calibration first, then what it reads, got {first} before {late[0]}")
     return load_calibration(Path(first)), inputs
 
 
@@ -175,6 +180,15 @@ def add_out(parser: argparse._ActionsContainer, text: str) -> None:
 def working(what: str) -> "tqdm[NoReturn]":
     """For a ``with`` block that takes seconds: a line that says what it does, where a person looks on."""
     return tqdm(desc=what, bar_format="{desc} ...", leave=False, disable=None)
+
+
+def ended(metric: bool, wrong: object, step: str = "") -> int:
+    """Print what to do next, and give the exit status: 1 where depth is not metric or something is wrong with the frames."""
+    if not metric:
+        step = f"{NOT_METRIC}, in no known unit: mend what the doubts name, and calibrate again"
+    if step:
+        print(f"next: {step}")
+    return 1 if wrong or not metric else 0
 
 
 def calibrated(background: Tensor, sensor: Sensor, presses: Sequence[Press], force: bool = False) -> Calibration:

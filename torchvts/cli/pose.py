@@ -1,7 +1,8 @@
 """Pose of a pressed object relative to a reference press: two frames, a sequence against a reference, or two clouds.
 
 SOURCE and REFERENCE are images, and CALIBRATION is what torchvts calibrate wrote; a folder of images or a video as SOURCE is
-followed frame by frame. Two clouds (.pcd, .ply) need no calibration. Exit status 1 where a pose was not found.
+followed frame by frame. Two clouds (.pcd, .ply) need no calibration. Exit status 1 where a pose was not found, or
+depth is not metric.
 
 examples:
   torchvts pose unit.safetensors source.png reference.png --out out/pose
@@ -21,12 +22,13 @@ from tqdm import tqdm
 from .. import viz
 from ..core.files import check_folder, make_folder, read_image, write_atomically
 from ..core.recordings import count_frames
+from ..model import Calibration
 from ..pipeline import DepthOutput
 from ..pose import OutputFrame, contact_cloud, read_point_cloud, register_depth, register_points, write_point_cloud
 from ..pose.clouds import CLOUD_SUFFIXES
 from ..pose.result import Registration
 from ..stream import Recording, frames
-from .options import add_length_unit, add_mode, add_network, add_out, load_calibration
+from .options import add_length_unit, add_mode, add_network, add_out, ended, load_calibration
 from .parser import UsageError
 
 USAGE = "CALIBRATION SOURCE REFERENCE --out FOLDER"
@@ -55,7 +57,11 @@ def run(arguments: argparse.Namespace) -> int:
         names = ", ".join(map(str, arguments.files))
         raise UsageError(f"expected a calibration file, an image, folder or video, and an image as reference, got {names}")
     check_folder(arguments.out)
-    results = of_clouds(arguments, *arguments.files) if all(clouds) else of_frames(arguments, *arguments.files)
+    if all(clouds):
+        metric, results = True, of_clouds(arguments, *arguments.files)
+    else:
+        unit = load_calibration(arguments.files[0])
+        metric, results = unit.metric, of_frames(arguments, unit, *arguments.files[1:])
     with write_atomically(make_folder(arguments.out) / "pose.json") as temporary:
         temporary.write_text(json.dumps(results if len(results) > 1 else results[0], indent=1) + "\n")
     without = [result for result in results if not result["converged"]]
@@ -63,12 +69,12 @@ def run(arguments: argparse.Namespace) -> int:
         print(f"no pose in {len(without)} of {len(results)} frames, the first {without[0]['frame']}: {without[0]['message']}")
     print(f"wrote {arguments.out / 'pose.json'}")
     if all(clouds):
-        print("next: T_target_source of pose.json takes points of the source to the target")
+        step = "T_target_source of pose.json takes points of the source to the target"
     elif without:
-        print(f"next: torchvts diagnose {arguments.files[0]} {arguments.files[1]} says what is wrong with the frames")
+        step = f"torchvts diagnose {arguments.files[0]} {arguments.files[1]} says what is wrong with the frames"
     else:
-        print(f"next: torchvts track {arguments.files[0]} FILM --out FOLDER follows the object from its first touch")
-    return 1 if without else 0
+        step = f"torchvts track {arguments.files[0]} FILM --out FOLDER follows the object from its first touch"
+    return ended(metric, without, step)
 
 
 def of_clouds(arguments: argparse.Namespace, source_file: Path, target_file: Path) -> list[dict[str, Any]]:
@@ -89,9 +95,8 @@ def of_clouds(arguments: argparse.Namespace, source_file: Path, target_file: Pat
     return [record(source_file.stem, found, frame)]
 
 
-def of_frames(arguments: argparse.Namespace, unit: Path, source: Path, reference: Path) -> list[dict[str, Any]]:
+def of_frames(arguments: argparse.Namespace, calibration: Calibration, source: Path, reference: Path) -> list[dict[str, Any]]:
     """Register every frame with the reference."""
-    calibration = load_calibration(unit)
     recording, pitch = Recording(calibration, arguments.mode, network=arguments.network), calibration.sensor.mm_per_pixel
     written = OutputFrame(arguments.length_unit, calibration.sensor)
 

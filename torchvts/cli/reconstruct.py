@@ -2,7 +2,7 @@
 
 The first of the files is the calibration that torchvts calibrate wrote. With --sensor in its place the unit is calibrated
 first: from --background and --press, or from the first frames of a video, which must be without contact.
-Exit status 1 where a frame was left out or is in doubt.
+Exit status 1 where a frame was left out or is in doubt, or depth is not metric.
 
 examples:
   torchvts reconstruct unit.safetensors press.png --out out/press
@@ -13,7 +13,6 @@ examples:
 
 import argparse
 import csv
-import itertools
 import os
 from pathlib import Path
 
@@ -23,13 +22,13 @@ from ..core.arrays import Array
 from ..core.files import make_folder
 from ..core.recordings import is_film
 from ..dataset import CLOUD_FORMATS, FORMATS, PICTURES_UP_TO, RunReport, list_items, reconstruct_dataset
-from ..diagnose import Finding, diagnose
+from ..diagnose import SEVERITIES, Finding, diagnose
 from ..model import Calibration, Sensor
 from ..model.report import warnings_of
-from ..model.summary import NOT_METRIC, SHOWN, doubts_of
+from ..model.summary import SHOWN, doubts_of
 from ..stream import Recording, frames, read_background, read_press_images
 from ..viz import NAME_SHOWN, save_figure, sheet_figure
-from .options import add_length_unit, add_out, add_pipeline, add_unit, calibrated, contact_of, split_files, working
+from .options import add_length_unit, add_out, add_pipeline, add_unit, calibrated, contact_of, ended, split_files, working
 from .parser import UsageError
 
 PASSED = (
@@ -88,8 +87,8 @@ def run(arguments: argparse.Namespace) -> int:
     for name, finding in findings:
         print(f"{name}: {finding}")
     wrong = [name for name, _ in [*findings, *report.failed, *report.doubted]]
-    print(f"next: {next_step(calibration, inputs, arguments, wrong)}")
-    return 1 if report.failed or report.doubted or any(finding.severity == "fault" for _, finding in findings) else 0
+    faults = any(finding.severity == "fault" for _, finding in findings)
+    return ended(unit.metric, report.failed or report.doubted or faults, next_step(calibration, inputs, arguments, wrong))
 
 
 def write_sheet(unit: Calibration, inputs: list[Path], arguments: argparse.Namespace) -> None:
@@ -103,20 +102,22 @@ def write_sheet(unit: Calibration, inputs: list[Path], arguments: argparse.Names
     recording = Recording(
         unit, arguments.mode, network=arguments.network, device=arguments.device, contact=contact_of(arguments.contact)
     )
-    items = (item for item in list_items(tuple(inputs), arguments.every) if not item.is_film)
-    shown: list[tuple[float | str, Array]] = []
-    for item in itertools.islice(items, SHEET):
+    items = [item for item in list_items(tuple(inputs), arguments.every) if not item.is_film]
+    shown: list[tuple[float | str, Array, str]] = []
+    for item in items[:SHEET]:
         try:
             image = unit.sensor.read_image(item.file).clamp(0.0, 1.0)[None]
         except (OSError, ValueError):  # said where it is to be reconstructed
             continue
         if not recording.unusable(image):
-            shown.append((item.path[-NAME_SHOWN:], recording(image).depth_mm[0, 0].double().numpy()))
-    if len(shown) > 1 and max(depth.max() for _, depth in shown) > 0.0:
+            depth = recording(image).depth_mm[0, 0].double().numpy()
+            shown.append((item.path[-NAME_SHOWN:], depth, recording.doubt))
+    if len(shown) > 1 and max(depth.max() for _, depth, _ in shown) > 0.0:
         make_folder(path.parent)
         with working(f"drawing {path.name}"):
-            save_figure(sheet_figure(shown, unit.sensor.mm_per_pixel, unit.metric), path)
-        print(f"wrote {path}: the first {len(shown)} images in one scale", flush=True)
+            title = f"the first {len(shown)} of {len(items)} images"
+            save_figure(sheet_figure(shown, unit.sensor.mm_per_pixel, title, unit.metric, warnings_of(unit.report)), path)
+        print(f"wrote {path}: {title} in one scale", flush=True)
 
 
 def next_step(calibration: Path, inputs: list[Path], arguments: argparse.Namespace, wrong: list[str]) -> str:
@@ -125,7 +126,8 @@ def next_step(calibration: Path, inputs: list[Path], arguments: argparse.Namespa
         source = inputs[0] if len(inputs) == 1 else "INPUT"
         return f"torchvts diagnose {calibration} {source} says what is wrong, the docs/diagnose.md page what to do"
     if arguments.format in ("npz", "video-npz"):
-        return f"vts.read_result(path) reads a file of {arguments.out} in Python; --cloud ply adds the contact as points"
+        points = "; --cloud ply adds the contact as points" if arguments.cloud == "none" else ""
+        return f"vts.read_result(path) reads a file of {arguments.out} in Python{points}"
     return f"{arguments.out / 'summary.json'} says what the files are"
 
 
@@ -146,9 +148,7 @@ def calibrate_first(arguments: argparse.Namespace, inputs: list[Path], unit: Sen
 
 
 def print_unit(unit: Calibration) -> None:
-    """Print why not to trust a calibration that was given."""
-    if not unit.metric:
-        print(NOT_METRIC)
+    """Print why not to trust a calibration that was given; that depth is not metric is the last line."""
     if warnings_of(unit.report):
         print(*doubts_of(unit.report), sep="\n")
 
@@ -181,7 +181,7 @@ def print_report(report: RunReport, out: Path, metric: bool) -> None:
 def diagnose_some(unit: Calibration, inputs: list[Path], report: RunReport, every: int) -> list[tuple[str, Finding]]:
     """What is wrong with :data:`DIAGNOSED` images, and the first frame of each video; frames that were left out are not asked.
 
-    A finding is given once, with its first frame and how many more have it. Of a frame in doubt only faults are given.
+    A finding is given once, as the worst frame has it, and how many more have it. Of a frame in doubt only faults are given.
     """
     left_out, doubted = ({name for name, _ in rows} for rows in (report.failed, report.doubted))
     items = list(list_items(tuple(inputs), every))
@@ -200,4 +200,6 @@ def diagnose_some(unit: Calibration, inputs: list[Path], report: RunReport, ever
         for finding in diagnose(None, image, unit):
             if finding.severity == "fault" or (finding.severity == "warning" and name not in doubted):
                 found.setdefault(finding.name, []).append((name, finding))
-    return [(same[0][0] + (f" and {len(same) - 1} more" if len(same) > 1 else ""), same[0][1]) for same in found.values()]
+    worst = (min(same, key=lambda pair: SEVERITIES.index(pair[1].severity)) for same in found.values())
+    more = (f" and {len(same) - 1} more" if len(same) > 1 else "" for same in found.values())
+    return [(name + others, finding) for (name, finding), others in zip(worst, more)]

@@ -1,7 +1,7 @@
 """Depth of a camera or a recording, frame by frame, into files; late frames of a camera are dropped. torchvts view shows it live.
 
 The first frames must be without contact. Ctrl-C ends it and finishes the files. Exit status 1 where a frame was left out
-or is in doubt.
+or is in doubt, or depth is not metric.
 
 examples:
   torchvts stream 0 --sensor gelsight_mini
@@ -14,8 +14,10 @@ import contextlib
 from pathlib import Path
 
 from ..core.files import check_folder, check_target, make_folder
+from ..model.report import warnings_of
 from ..stream import Overlay, Sheet, StreamReport, TactileFrame, TactileStream, VideoFile
 from ..viz import save_figure
+from .options import ended
 from .source import add_source, add_video, load_unit, open_stream, play
 
 USAGE = "CALIBRATION SOURCE [--out FOLDER]"
@@ -49,7 +51,7 @@ def run(arguments: argparse.Namespace) -> int:
         report = StreamReport(stream, arguments.motion)
         if arguments.out is not None:  # not before: a source that is refused leaves none
             make_folder(arguments.out)
-        sheet = Sheet(stream.calibration.sensor.mm_per_pixel, stream.metric)
+        sheet = Sheet(stream.calibration.sensor.mm_per_pixel, stream.metric, warnings_of(stream.calibration.report))
         video = None
         if arguments.out is not None and arguments.video != "none":
             video = stack.enter_context(VideoFile(arguments.out / f"overlay.{arguments.video}", stream.fps))
@@ -61,13 +63,14 @@ def run(arguments: argparse.Namespace) -> int:
                 save_figure(sheet.figure(), arguments.out / "sheet.png")
     if arguments.out is not None:
         print(f"wrote {len(report.rows)} frames to {arguments.out}")
-    if stream.left_out or report.doubted:
-        print("next: torchvts diagnose CALIBRATION RECORDING says what is wrong; --record keeps a camera's frames for it")
-    elif arguments.out is not None and sheet.times:
-        print(f"next: look at {arguments.out / 'sheet.png'}; frames.csv has depth and area of each frame")
     if lost is not None:
         raise lost
-    return 1 if stream.left_out or report.doubted else 0
+    step, wrong = "", stream.left_out or report.doubted
+    if wrong:
+        step = "torchvts diagnose CALIBRATION RECORDING says what is wrong; --record keeps a camera's frames for it"
+    elif arguments.out is not None and sheet.times:
+        step = f"look at {arguments.out / 'sheet.png'}; frames.csv has depth and area of each frame"
+    return ended(stream.metric, wrong, step)
 
 
 class _Files:
@@ -80,7 +83,7 @@ class _Files:
 
     def add(self, frame: TactileFrame) -> bool:
         lines = self.report.add(frame)
-        self.sheet.add(frame)
+        self.sheet.add(frame, self.stream.doubt)
         if self.video is not None:
             with self.stream.stages.stage("draw"):
                 picture = self.overlay(frame, lines)

@@ -1,9 +1,9 @@
 """Pose of a touched object in every frame of a camera or a recording, from where it first touches.
 
 The first frames must be without contact. The reference is the first frame with a contact of --least-mm2, or the image --reference.
-Writes poses.csv (a pose a frame, standard deviations in mm and degrees, what is unknown, why it was lost), summary.json and a
-video with the axes of the reference on the image. Ctrl-C ends it and finishes the files. Exit status 1 where the object was lost
-or a frame was left out.
+Writes poses.csv (a pose a frame, standard deviations, what is unknown, why it was lost), summary.json and a video with
+the axes of the reference on the image. Ctrl-C ends it and finishes the files. Exit status 1 where the object was lost, a frame
+was left out, or depth is not metric.
 
 examples:
   torchvts track video.avi --sensor gelsight_wedge --out out/track
@@ -27,13 +27,12 @@ from torch import Tensor
 
 from ..core.checks import NAMED, check_positive
 from ..core.files import Pixels, check_folder, make_folder, read_image, write_atomically
-from ..model.summary import NOT_METRIC
 from ..pose import OutputFrame, PoseTracker, TrackedPose
 from ..pose.follow import TRUSTED_DEG, TRUSTED_MM
 from ..stream import LiveView, Overlay, TactileFrame, TactileStream, VideoFile, has_screen
 from ..stream.files import summary_of
 from ..stream.view import AXIS_COLOURS
-from .options import add_length_unit, add_out
+from .options import add_length_unit, add_out, ended
 from .parser import UsageError
 from .source import add_source, add_video, load_unit, open_stream, play
 
@@ -97,13 +96,14 @@ def run(arguments: argparse.Namespace) -> int:
     print(f"wrote {', '.join(names)} to {arguments.out}")
     if arguments.save is not None:
         print(f"wrote {arguments.save}; rerun {arguments.save} shows it")
-    if found["lost"] or found["left_out"]:
-        print("next: column lost of poses.csv says why; torchvts diagnose CALIBRATION RECORDING looks at the frames")
-    elif arguments.video != "none":
-        print(f"next: look at {arguments.out / f'track.{arguments.video}'}: the axes should stay on the object")
     if lost is not None:
         raise lost
-    return 1 if found["lost"] or found["left_out"] else 0
+    step, wrong = "", found["lost"] or found["left_out"]
+    if wrong:
+        step = "column lost of poses.csv says why; torchvts diagnose CALIBRATION RECORDING looks at the frames"
+    elif arguments.video != "none":
+        step = f"look at {arguments.out / f'track.{arguments.video}'}: the axes should stay on the object"
+    return ended(found["metric"], wrong, step)
 
 
 class _Tracking:
@@ -254,5 +254,3 @@ def _print_summary(found: dict[str, Any]) -> None:
     if found["keyframes"] > 1:
         deg, mm = found["largest_drift_deg"], found["largest_drift_mm"]
         print(f"  drift over keyframes: up to {deg:.2g} degrees and {mm:.2g} mm")
-    if not found["metric"]:
-        print(f"  {NOT_METRIC}; shifts in mm are not either")

@@ -2,7 +2,7 @@
 
 The first frames must be without contact. Without a screen, --save FILE.rrd records what the viewer would show; rerun FILE.rrd
 opens it anywhere. Keys, in this terminal (or letters on standard input): z re-zero (lift the object first), s snapshot,
-r start and end a recording, q end.
+r start and end a recording, q end. Exit status 1 where a frame was left out or is in doubt, or depth is not metric.
 
 examples:
   torchvts view 0 --sensor gelsight_mini
@@ -19,7 +19,7 @@ from ..skin import motion_of_unit
 from ..stream import Keys, LiveView, StreamReport, TactileFrame, TactileStream, has_screen, require_rerun
 from ..stream.view import EXAGGERATION
 from ..viz import depth_figure, save_figure
-from .options import load_calibration
+from .options import ended, load_calibration
 from .parser import UsageError
 from .source import add_source, load_unit, open_stream, play
 from .web_page import serve
@@ -67,7 +67,7 @@ def run(arguments: argparse.Namespace) -> int:
         print(f"wrote {arguments.save}; rerun {arguments.save} shows it")
     if lost is not None:
         raise lost
-    return 1 if stream.left_out else 0
+    return ended(stream.metric, stream.left_out or viewing.report.doubted)
 
 
 class _Viewing:

@@ -128,8 +128,9 @@ class Gain(nn.Module):
         offset: (3, H, W), or None for 0.
     """
 
-    gain: Tensor | None
-    offset: Tensor | None
+    if TYPE_CHECKING:  # to TorchScript each is what it is: torch.jit.trace fails on optional tensors
+        gain: Tensor | None
+        offset: Tensor | None
 
     def __init__(self, gain: Tensor | None, offset: Tensor | None) -> None:
         super().__init__()

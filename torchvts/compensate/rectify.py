@@ -35,7 +35,8 @@ class Rectify(nn.Module):
     """
 
     view: CameraView
-    places: Tensor | None
+    if TYPE_CHECKING:  # not for TorchScript, see Gain
+        places: Tensor | None
 
     def __init__(self, sensor: Sensor) -> None:
         super().__init__()

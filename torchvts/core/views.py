@@ -9,6 +9,7 @@ import torch
 from torch import nn
 
 from .arrays import Array, cell_means, lower_median
+from .levels import BLACK
 
 CROPS = (0.1, 1.0 / 7.0, 0.2)
 """Shares of each side that one image may show beyond the other: raw frames of a GelSight Mini are cut by a seventh."""
@@ -102,8 +103,13 @@ class Views:
         return cell_means(image[:, top:, left:], self._cell)
 
     def difference(self, cells: Array) -> float:
-        """Median difference of :meth:`cells` of an image from the background's, logarithm of the image value."""
-        return _median(_differences(_log(cells), self._own))
+        """Median difference of :meth:`cells` of an image from the background's, logarithm of the image value.
+
+        Cells do not count where a channel of the background is black: nothing darker can differ from it.
+        """
+        lit = (self.background > BLACK).all(axis=0)
+        counted = lit if lit.any() else ~lit
+        return _median(_differences(_log(cells)[:, counted, None], self._own[:, counted, None]))
 
     def other(self, cells: Array) -> OtherView | None:
         """The other view that :meth:`cells` of an image show; None where they show the background's, or none that is known."""

@@ -79,7 +79,8 @@ def list_items(source: str | Path | Source, every: int = 1) -> Iterator[Item]:
     Args:
         source: an image, a video, a folder, or several of them.
         every: list only each N-th image, and all videos.
-
+    Raises:
+        FileNotFoundError: no such source.
     Example:
         >>> import tempfile
         >>> with tempfile.TemporaryDirectory() as folder:
@@ -109,6 +110,8 @@ def _item(file: Path, prefix: str, stem: str) -> Item:
     try:
         status = (file if container is None else container[1]).stat()
     except OSError:  # a link that leads nowhere, or to itself: said when it is read
+        if not file.is_symlink():
+            raise FileNotFoundError(f"{file}: no such file or folder") from None
         status = file.lstat()
     return Item(prefix + file.name, prefix + stem, (status.st_size, status.st_mtime_ns), file, is_film(file))
 

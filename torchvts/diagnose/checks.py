@@ -186,8 +186,9 @@ def _unusable(e: Examination) -> Finding | None:
 
 
 def _failed(e: Examination, image: torch.Tensor | None) -> Figures:
-    """Number of the channels that an image has lost."""
+    """Number of the channels that an image has lost; of a frame that has lost all :func:`_unusable` says more."""
     failed = [] if image is None else e.failed_in(image)
+    failed = [] if len(failed) == len(CHANNELS) and image is e.image else failed
     rough = "with two LEDs left mode precise still finds a rough depth, with one none does"
     left = "the response of this unit needs all of them" if e.unit.lights is None else rough
     return {"value": float(len(failed)), "colors": " and ".join(CHANNELS[j] for j in failed), "left": left}

@@ -9,6 +9,9 @@ SEVERITIES = ("fault", "warning", "note")
 WARNING_DEG, FAULT_DEG = 0.5, 3.0
 """Errors of normals from which a finding is a warning, and a fault."""
 
+COST_DEG = {"fault": FAULT_DEG, "warning": WARNING_DEG, "note": 0.0}
+"""The least error of normals that a severity stands for: of several frames the sum tells which finding costs most."""
+
 
 def by_cost(cost_deg: float) -> str:
     """The severity of an error of normals.

@@ -127,13 +127,18 @@ class PoissonDST(Integrator):
 
 
 class PoissonDCT(Integrator):
-    """Module for :func:`poisson_dct`; keeps the tables of the last size, so that a stream of frames makes them once."""
+    """Module for :func:`poisson_dct`; keeps the tables of the last size, so that a stream of frames makes them once.
 
-    def __init__(self, mm_per_pixel: float = 1.0) -> None:
+    Args:
+        mm_per_pixel: pixel pitch, mm.
+        size: height and width whose tables are there before the first call; :func:`torch.jit.trace` would record how they are made.
+    """
+
+    def __init__(self, mm_per_pixel: float = 1.0, size: tuple[int, int] = (2, 2)) -> None:
         super().__init__()
         self.mm_per_pixel = check_positive("mm_per_pixel", mm_per_pixel)
         self.zero_in_background = False
-        self._plan: list[Tensor] = plan_dct(torch.zeros(1, dtype=torch.float64), 2, 2)
+        self._plan: list[Tensor] = plan_dct(torch.zeros(1, dtype=torch.float64), *size)
 
     def forward(self, gradient: Tensor) -> Tensor:
         check_gradient(gradient, 2)

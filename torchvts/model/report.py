@@ -7,6 +7,9 @@ from ..core.checks import brief
 NOT_CHECKED = "not checked"
 """How the doubt begins that says what no image could show: it is no warning."""
 
+COUNTS_LITTLE = 0.5
+"""A press that counts less than this part of one is named with its weight."""
+
 Model = Literal["point_lights", "response"]
 
 Source = Literal["given", "sensor_file", "background", "prior", "presses", "stand_in"]

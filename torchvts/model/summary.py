@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from ..core.tables import markdown, number
 from .calibration import Calibration
 from .lights import PointLights
-from .report import NOT_CHECKED, PressRow, Report
+from .report import COUNTS_LITTLE, NOT_CHECKED, PressRow, Report
 from .stated_error import UNKNOWN_DEG, press_next
 
 SHOWN = 5
@@ -49,6 +49,7 @@ def summary_of(calibration: Calibration, tried: bool = False) -> str:
     if saturated > SATURATED_SHARE:
         lines.append(f"saturated: {saturated:.0%} of the background: depth is worse there; reduce the exposure and calibrate again")
     lines += doubts_of(report)
+    lines += counts_little(report.get("presses", []))
     lines += left_out("press", [(row["name"], row.get("reason", "")) for row in report.get("presses", []) if not row["used"]])
     if tried:
         lines += ["", *_tried(report)]
@@ -101,6 +102,15 @@ def expected(calibration: Calibration) -> str:
     return f"{degrees}, by what so few presses leave open; more presses of a ball would measure it"
 
 
+def counts_little(presses: list[PressRow]) -> Iterator[str]:
+    """A line for the presses that count less than :data:`COUNTS_LITTLE`, with their weights, and are no doubt of their own."""
+    rows = [row for row in presses if row["used"] and not row.get("reason") and row.get("weight", 1.0) < COUNTS_LITTLE]
+    if rows:
+        named = [f"{row['name']} {row['weight']:.2f}" for row in sorted(rows, key=lambda row: row["weight"])]
+        more = f" and {len(named) - SHOWN} more" if len(named) > SHOWN else ""
+        yield f"counts little, of 1 for a press, since its size agrees less with the others: {', '.join(named[:SHOWN])}{more}"
+
+
 def left_out(what: str, rows: list[tuple[str, str]]) -> Iterator[str]:
     """A line for each of the first that were left out, and how many more there are."""
     for name, reason in rows[:SHOWN]:
@@ -133,8 +143,9 @@ def _presses(presses: list[PressRow]) -> list[str]:
     for press in presses:
         center = ", ".join(f"{v:.1f}" for v in press["center_px"]) if "center_px" in press else ""
         wide = 1.0 / max(press["gain"], 1e-3) if "gain" in press else None
-        figures = [number(press.get("contact_radius_px"), 1), number(press.get("error_deg"), 1), number(wide, 2)]
+        counts = number(press.get("weight"), 2)
+        figures = [number(press.get("contact_radius_px"), 1), number(press.get("error_deg"), 1), number(wide, 2), counts]
         rows.append([press["name"], center, *figures, f"{'' if press['used'] else 'left out: '}{press.get('reason', '')}"])
-    titles = ("press", "center px", "contact radius px", "error deg", "times as wide as given", "")
+    titles = ("press", "center px", "contact radius px", "error deg", "times as wide as given", "counts", "")
     meaning = "error, times as wide: slopes by the field of the other presses, or by the prior, compared with the ball's"
     return [markdown(titles, rows), meaning]

@@ -157,7 +157,7 @@ class DepthPipeline(nn.Module):
                 ContactMask.from_calibration(calibration, settings),
                 normals,
                 GradientFromNormal(),
-                PoissonDCT(sensor.mm_per_pixel) if integrate is None else integrate,
+                PoissonDCT(sensor.mm_per_pixel, (sensor.height, sensor.width)) if integrate is None else integrate,
             )
             touching = ContactFromDepth.from_calibration(calibration, settings)
             pipe = cls(*modules, mm_per_pixel=sensor.mm_per_pixel, mode=mode, contact=touching)

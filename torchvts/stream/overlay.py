@@ -159,21 +159,22 @@ class Sheet:
     Args:
         mm_per_pixel: pixel pitch, mm.
         metric: whether depth is in mm; otherwise the sheet says that it is not.
+        doubts: why not to trust it, a sentence each, below the panels.
     """
 
     _MOST = 48
 
-    def __init__(self, mm_per_pixel: float, metric: bool = True) -> None:
-        self.mm_per_pixel, self.metric = check_positive("mm_per_pixel", mm_per_pixel), metric
-        self._kept: list[tuple[float, Tensor]] = []
+    def __init__(self, mm_per_pixel: float, metric: bool = True, doubts: Sequence[str] = ()) -> None:
+        self.mm_per_pixel, self.metric, self.doubts = check_positive("mm_per_pixel", mm_per_pixel), metric, doubts
+        self._kept: list[tuple[float, Tensor, str]] = []
         self._every = self._seen = 0
 
-    def add(self, frame: TactileFrame) -> None:
-        """Keep a frame with contact; of a long stream every second, fourth, ... of them."""
+    def add(self, frame: TactileFrame, doubt: str = "") -> None:
+        """Keep a frame with contact, and why it is in doubt; of a long stream every second, fourth, ... of them."""
         if not bool(frame.output.contact.any()):
             return
         if self._seen % (1 << self._every) == 0:
-            self._kept.append((frame.time_s, frame.output.depth_mm[0, 0].half().cpu()))
+            self._kept.append((frame.time_s, frame.output.depth_mm[0, 0].half().cpu(), doubt))
         self._seen += 1
         if len(self._kept) > self._MOST:
             self._kept, self._every = self._kept[::2], self._every + 1
@@ -181,7 +182,7 @@ class Sheet:
     @property
     def times(self) -> list[float]:
         """Times of the frames that are kept, s."""
-        return [time_s for time_s, _ in self._kept]
+        return [time_s for time_s, _, _ in self._kept]
 
     def figure(self) -> "Figure":
         """The sheet.
@@ -193,8 +194,9 @@ class Sheet:
             raise ValueError("sheet: expected frames with contact, got none: there is nothing to draw")
         from ..viz import sheet_figure
 
-        most = max(float(depth.max()) for _, depth in self._kept)
+        most = max(float(depth.max()) for _, depth, _ in self._kept)
         deep = [kept for kept in self._kept if float(kept[1].max()) >= 0.1 * most]  # no panel without a visible depth
         places = np.unique(np.linspace(0, len(deep) - 1, 6).round().astype(int))
-        chosen = [(time_s, depth.double().numpy()) for time_s, depth in (deep[k] for k in places)]
-        return sheet_figure(chosen, self.mm_per_pixel, self.metric)
+        chosen = [(time_s, depth.double().numpy(), doubt) for time_s, depth, doubt in (deep[k] for k in places)]
+        title = f"{len(chosen)} of {self._seen} frames in contact"
+        return sheet_figure(chosen, self.mm_per_pixel, title, self.metric, self.doubts)

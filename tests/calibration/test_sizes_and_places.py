@@ -134,3 +134,46 @@ def test_what_is_calibrated_can_be_saved_and_loaded(seed, tmp_path):
     calibration.save(tmp_path / "unit.safetensors")
     loaded = vts.Calibration.load(tmp_path / "unit.safetensors")
     assert loaded.report == calibration.report and torch.equal(loaded.background, calibration.background)
+
+
+def by_balls(unit, diameter, depth, count=3):
+    """A calibration by bare presses of balls; diameter and depth as shares of the short side and of the diameter."""
+    wide, high = (n * unit.sensor.mm_per_pixel for n in (unit.sensor.width, unit.sensor.height))
+    short, places = min(wide, high), ((-0.2, -0.2), (0.2, -0.15), (-0.15, 0.2), (0.2, 0.2))[:count]
+    presses = [
+        unit.ball(diameter * short, depth * diameter * short, (x * wide, y * high), f"ball {k}", k)
+        for k, (x, y) in enumerate(places)
+    ]
+    return vts.calibrate(unit.background, unit.sensor, bare(presses))
+
+
+def slopes_over_true(calibration, press):
+    """Slopes in the contact of a press, over the true ones, by least squares."""
+    with torch.no_grad():
+        out = vts.DepthPipeline.from_calibration(calibration, "fast")(press.image[None])
+    found, true = (slope[press.scene.contact.expand_as(slope)] for slope in (out.gradient, press.scene.gradient))
+    return float((found * true).sum() / true.square().sum())
+
+
+@pytest.mark.parametrize(("diameter", "depth"), [(0.35, 0.03), (0.1, 0.25)], ids=["shallow", "tiny"])
+def test_balls_that_are_shallow_or_tiny_teach_the_slopes_of_larger_objects(diameter, depth):
+    """The former show no steep skin, and blur takes from the rims of both."""
+    unit = drawn_sensor(0)
+    ratio = slopes_over_true(by_balls(unit, diameter, depth), unit.objects[3])
+    assert 0.75 < ratio < 1.3
+
+
+def test_presses_in_another_gamma_are_named_and_make_bounds_wider(whole):
+    """They leave depth in mm: what a gamma may have done to it is a number."""
+    unit = half_drawn(0)
+    presses = [dataclasses.replace(press, image=press.image.clamp_min(0.0) ** 0.85) for press in bare()]
+    with pytest.warns(CalibrationWarning, match="light differs from the background's by .*another gamma"):
+        calibration = vts.calibrate(unit.background, unit.sensor, presses)
+    assert calibration.metric and calibration.report["uneven"] > 2.0 * whole[0].report["uneven"]
+    press, bounds = unit.objects[0], []
+    for one in (whole[0], calibration):
+        with torch.no_grad():
+            out = vts.ConfidentPipeline.from_calibration(one, "fast")(press.image[None])
+        bounds.append(float(out.depth_95_mm[press.scene.contact].mean()))
+    off = (out.depth_mm - press.scene.depth_mm).abs()[press.scene.contact]
+    assert bounds[1] > 1.2 * bounds[0] and float((off < out.depth_95_mm[press.scene.contact]).float().mean()) > 0.95

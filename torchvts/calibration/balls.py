@@ -53,7 +53,7 @@ def locate(contacts: list[Contact], sensor: Sensor, prior: ResponseModel | None,
         close_loops(usable, half_mm)
     for contact in usable:
         if not contact.reason and int(contact.inside().sum()) < LEAST_SAMPLES:
-            contact.reason = "no ball of this diameter fits the contact"
+            contact.reason = "no ball of this diameter fits the contact: wrong diameter, or a contact of too few pixels"
 
 
 def wrong_label(contact: Contact, sensor: Sensor) -> str:

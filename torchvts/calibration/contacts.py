@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ..compensate import Compensate
-from ..compensate.light import unevenness
+from ..compensate.light import unchanged_light, unevenness
 from ..core.blur import band_of_ratios, without_margin
 from ..core.geometry import gradient_from_normal, pixel_grid_mm
 from ..core.levels import BLACK, MOST_SATURATED, SATURATED
@@ -25,6 +25,12 @@ from .regions import LIGHT_DRIFT, above_skin, contact_region
 
 INSIDE = 0.85
 """Share of the contact radius within which the skin lies on the ball; further out it begins to leave it."""
+
+RIM = 2.0
+"""Standard deviations of the image's blur from the rim inwards in which the skin looks flatter than the ball."""
+
+CORE = 0.5
+"""Share of the contact radius, its core, that is used however small a contact is."""
 
 LEAST_SAMPLES = 10
 """Sampled pixels that a contact needs inside of that radius, and the zone around it that a fit uses."""
@@ -55,7 +61,8 @@ class Contact:
         half_size_mm: (2,), half the width and height of the image, mm.
         center_mm: (2,), center of the ball, as far as known.
         contact_radius_mm: radius of the contact, as far as known.
-        uneven: unevenness of the image's light beside the background's.
+        blur_mm: standard deviation of the blur of the image, mm.
+        light: of the image, relative to the background's, (3, 6), see :meth:`torchvts.compensate.light.Relight.terms`.
         known: the center was given and is not searched.
         radius_known: the contact radius was given and is not searched.
         weight: how much of a press it counts, by what the others expect of it.
@@ -73,9 +80,10 @@ class Contact:
     saturated: Tensor
     radius_mm: float
     half_size_mm: Tensor
+    blur_mm: float
     center_mm: Tensor = field(default_factory=lambda: torch.zeros(2, dtype=torch.float64))
     contact_radius_mm: float = 0.0
-    uneven: float = 0.0
+    light: Tensor = field(default_factory=lambda: unchanged_light(torch.zeros(1, 3, 1, 1))[0])
     known: bool = False
     radius_known: bool = False
     weight: float = 1.0
@@ -91,7 +99,8 @@ class Contact:
     def inside(self) -> Tensor:
         """(N,) bool: sampled pixels where the skin lies on the ball. Saturated ones too: frames have them, and a field that was not
         fitted to them is 1.5 to 2 times as far off there."""
-        return self.polar()[2] < INSIDE * self.contact_radius_mm
+        rim = RIM * self.blur_mm / max(self.contact_radius_mm, 1e-9)
+        return self.polar()[2] < min(INSIDE, max(CORE, 1.0 - rim)) * self.contact_radius_mm
 
     def height_above_equator(self) -> Tensor:
         """(N,) mm: height of the ball's surface above its equator; where its sine is beyond ``MAX_SINE``, that at it."""
@@ -114,6 +123,15 @@ class NoUsablePress(ValueError):
 def used(contacts: Sequence[Contact]) -> list[Contact]:
     """The contacts that are not left out."""
     return [contact for contact in contacts if not contact.reason]
+
+
+def uneven_light(contacts: Sequence[Contact]) -> float:
+    """Unevenness of what the light of all contacts has in common beside the background's, root mean square over the channels.
+
+    That of one contact is there once; that of another gamma, saturation or lamp in all of them.
+    """
+    common = torch.stack([contact.light / contact.light[:, :1].clamp_min(1e-6) for contact in contacts]).mean(dim=0)
+    return float(unevenness(common[None]).square().mean().sqrt())
 
 
 def read_contacts(given: Sequence[Press], background: Tensor, sensor: Sensor) -> list[Contact]:
@@ -140,7 +158,7 @@ def read_contacts(given: Sequence[Press], background: Tensor, sensor: Sensor) ->
         region = contact_region(above, differs, 0.5 * item.ball_diameter_mm / sensor.mm_per_pixel)
         saturated = ((item.image > SATURATED) & (background < SATURATED)).any(dim=0).cpu()
         contact = _sampled(item, change.double(), region, saturated, sensor)
-        contact.uneven = float(unevenness(compensate.light_of(item.image.detach().cpu().float()[None])).max())
+        contact.light = compensate.light_of(item.image.detach().cpu().float()[None])[0].double()
         contact.reason = _no_press(differs, spread) or _saturated(float(saturated[region].double().mean()))
         if item.center_px is not None:
             _place(contact, item, sensor)
@@ -168,7 +186,8 @@ def _sampled(given: Press, change: Tensor, mask: Tensor, saturated: Tensor, sens
     x, y = pixel_grid_mm(sensor.height, sensor.width, sensor.mm_per_pixel, torch.float64)
     radius_mm = 0.5 * given.ball_diameter_mm
     index, half = rows * sensor.width + columns, middle_px(sensor) * sensor.mm_per_pixel
-    return Contact(given.name, change, mask, index, x[0, columns], y[rows, 0], saturated.flatten()[index], radius_mm, half)
+    blur_mm = sensor.blur_px * sensor.mm_per_pixel
+    return Contact(given.name, change, mask, index, x[0, columns], y[rows, 0], saturated.flatten()[index], radius_mm, half, blur_mm)
 
 
 def _place(contact: Contact, press: Press, sensor: Sensor) -> None:

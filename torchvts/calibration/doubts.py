@@ -16,7 +16,7 @@ from ..model.calibration import Calibration
 from ..model.report import NOT_CHECKED
 from ..model.response_field import ResponseField
 from ..model.sensor import Sensor
-from .contacts import Contact, differing, used
+from .contacts import Contact, differing, uneven_light, used
 from .field import Family, seen_slopes
 from .lights import NOTHING_LEFT
 from .outliers import PRESS_GAIN
@@ -81,8 +81,8 @@ def of_presses(contacts: Sequence[Contact], field: ResponseField, pitch_mm: floa
         width: of those, see :func:`width_of`.
     """
     good = used(contacts)
-    uneven = statistics.median(contact.uneven for contact in contacts)
-    other = [Doubt(_other_light(uneven), True)] if uneven > UNEVEN else []
+    uneven = uneven_light(good)
+    other = [Doubt(_other_light(uneven))] if uneven > 0.5 * UNEVEN else []
     found = other + [Doubt(f"{contact.name}: left out: {contact.reason}") for contact in contacts if contact.reason]
     found += [Doubt(f"{contact.name}: {contact.doubt}") for contact in good if contact.doubt]
     found += _sizes_by_each_other(good) + _directions(field, good)
@@ -91,7 +91,7 @@ def of_presses(contacts: Sequence[Contact], field: ResponseField, pitch_mm: floa
 
 def _other_light(uneven: float) -> str:
     return (
-        f"presses: their light differs from the background's by {uneven:.0%} unevenly, in the median (usual: up to {UNEVEN:.0%}): "
+        f"presses: their light differs from the background's by {uneven:.0%} unevenly (usual: less than {0.5 * UNEVEN:.0%}): "
         "another gamma, saturation or white balance of the camera: take background, presses and frames with the same settings"
     )
 

@@ -9,7 +9,7 @@ from ..model.calibration import Calibration
 from ..model.report import Report
 from ..model.response_field import SensorPrior
 from ..model.sensor import Sensor
-from .contacts import Contact, press_row, read_contacts, used
+from .contacts import Contact, press_row, read_contacts, uneven_light, used
 from .posterior import weights_of
 from .presses import Press
 from .response_fit import fit_response
@@ -49,6 +49,7 @@ def by_presses(
         "own_deg": fit.own_deg,
         "stated_deg": fit.stated_deg,
         "presses": [press_row(contact, sensor) for contact in contacts],
+        "uneven": uneven_light(used(contacts)),
     }
     if prior is not None:
         report["prior_deg"] = prior.expected_deg

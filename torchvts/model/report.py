@@ -83,6 +83,8 @@ class Report(_ReportKeys, total=False):
         doubts: all that speaks against the calibration, a sentence each with its remedy; what nothing could check comes last.
         not_metric: those of them that put the scale of depth in doubt; empty where depth is in mm.
         presses: one row per press.
+        uneven: how uneven their light is, beside the background's, see :func:`torchvts.calibration.contacts.uneven_light`: another
+            gamma or saturation of the camera, which changes all slopes, or another lamp.
         held_out_deg: mean error on presses by a response fitted to the other presses, degrees; None with too few presses.
         own_deg: mean error on the very presses that a response, or its prior, was fitted to, degrees.
         stated_deg: error of normals to expect anywhere on the skin, degrees: by the covariance, or the record of a prior alone.
@@ -99,6 +101,7 @@ class Report(_ReportKeys, total=False):
     doubts: list[str]
     not_metric: list[str]
     presses: list[PressRow]
+    uneven: float
     held_out_deg: float | None
     own_deg: float
     stated_deg: float

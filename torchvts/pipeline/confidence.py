@@ -205,6 +205,7 @@ class Confidence(nn.Module):
         self.fixed = 1.0 if calibration.measured else 0.0
         pattern = float((calibration.background + PEDESTAL).log().flatten(1).std(dim=1).square().mean().sqrt())
         self.per_uneven = pattern / (pattern**2 + FAINT_PATTERN**2)
+        self.uneven_at_calibration = calibration.report.get("uneven", 0.0)
         edge_px = math.sqrt(2.0 * blur_px**2 + GRID_PX2)  # the camera's own blur is taken to be as wide as the calibration's
         self.weights = gaussian_weights(min(edge_px, MOST_BLUR_PX))
         self.reach = math.ceil(edge_px)
@@ -259,18 +260,19 @@ class Confidence(nn.Module):
         unseen = torch.tan(torch.deg2rad(unseen_deg(self.gradient(base.detach()), self.cells, self.sure, self.least_spread)))
         spread = (unseen / self.sure).square() - self.cell_share * noise.flatten(1).median(dim=1).values  # which counts already
         spread = spread.clamp_min(0.0)[:, None, None, None]  # of slopes
+        contrast = torch.full_like(unseen, self.uneven_at_calibration**2)
         if light is not None:
             if not torch.jit.is_scripting():
                 check_tensor("light", light)
             if light.shape != (images.shape[0], 3, 6):
                 raise ValueError(f"light: expected ({images.shape[0]}, 3, 6), got {light.shape}: conditions.light of these images")
             uneven = light[:, :, 1:].detach().square().sum(dim=2) / light[:, :, 0].detach().square().clamp_min(1e-6)
-            contrast = (self.per_uneven**2 * uneven.mean(dim=1))[:, None, None, None]
-            spread = spread + contrast * out.gradient.square().sum(dim=1, keepdim=True)
+            contrast = contrast + uneven.mean(dim=1)
             # of lights 120 degrees apart: u where all slopes are u
             unseen = torch.sqrt(unseen.square() + uneven.sum(dim=1) / 1.5)
         unseen = torch.atan(unseen)
-        spread = spread * steep.square()
+        of_slopes = (self.per_uneven**2 * contrast)[:, None, None, None] * out.gradient.square().sum(dim=1, keepdim=True)
+        spread = (spread + of_slopes) * steep.square()
         inside = out.deformed.to(noise.dtype)
         better = self.gradient(again)
         surface = self._not_integrable(out, better, inside, noise / steep.square()) * steep.square()

@@ -16,7 +16,7 @@ ZERO_CELLS = 30
 WAVES = 8
 """Cosine terms along the shorter side of which the offset is made."""
 
-DECAY_MM = 1.5
+DECAY_MM = 2.0
 """L, the length on which free skin decays."""
 
 SMOOTH_MM = 0.35
@@ -95,7 +95,7 @@ class ZeroBackground(nn.Module):
         reach = (depth.amax(dim=(1, 2), keepdim=True) - depth.amin(dim=(1, 2), keepdim=True)).clamp_min(1e-9)
         free = weight < 0.1
         any_free = free.flatten(1).any(dim=1)
-        start = -lower_quartile(depth.flatten(1), free.flatten(1))
+        start = -lower_eighth(depth.flatten(1), free.flatten(1))
         z = depth + start[:, :, None]
         unchanged = (1.0 - weight) / (1.0 + (z / (self.face * reach)).square()).square()
         pit = self.pit * weight * (-z / (self.pit_share * reach) - 1.0).clamp(0.0, 1.0)
@@ -150,8 +150,8 @@ def wave_numbers(terms: int, length: float, like: Tensor) -> Tensor:
     return math.pi / length * torch.arange(terms, dtype=like.dtype, device=like.device)
 
 
-def lower_quartile(values: Tensor, some: Tensor) -> Tensor:
-    """Lower quartile of some of the values (B, N), (B, 1); the least of all where there are none."""
+def lower_eighth(values: Tensor, some: Tensor) -> Tensor:
+    """Lower eighth of some of the values (B, N), (B, 1); the least of all where there are none."""
     count = some.sum(dim=1, keepdim=True)
     ordered = torch.where(some | (count == 0), values, torch.inf).sort(dim=1).values
-    return ordered.gather(1, count // 4)
+    return ordered.gather(1, count // 8)

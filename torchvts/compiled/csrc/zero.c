@@ -59,14 +59,14 @@ static void find_pressure(const Work *at, double decay) {
         }
 }
 
-/* The lower quartile of depth where it is free, negative: how the offset starts. some: 2 n floats. */
+/* The lower eighth of depth where it is free, negative: how the offset starts, below faces of the object. some: 2 n floats. */
 static double start_of(const Work *at, float *some, int *any_free) {
     int count = 0, all;
     for (int k = 0; k < at->n; k++)
         if (at->weight[k] < 0.1) some[count++] = (float)at->depth[k];
     *any_free = count > 0, all = count ? count : at->n;
     for (int k = 0; k < at->n && !count; k++) some[k] = (float)at->depth[k];
-    return -(double)sorted(some, some + all, all)[count / 4];
+    return -(double)sorted(some, some + all, all)[count / 8];
 }
 
 /* result (lines, width) += factors (lines, n) times values (n, width), four values at a time, which spares memory. */

@@ -22,8 +22,11 @@ SAME_VIEW = 0.05
 0.05 for presses on 13 units, 0.08 on one whose light drifts, and 0.07 to 1.1 for these turned, mirrored or swapped."""
 
 NEAR = 0.1
-"""Difference of the logarithm below which a cell looks like the background. Another view is named if it leaves less than that, and
-less than the image as it is: of a press on 14 units the best other view leaves at least 1.9 times as much."""
+"""Difference of the logarithm below which a cell looks like the background."""
+
+BETTER = 0.6
+"""Another view is named if it leaves less than this part of the difference. On 14 units the best other view leaves at least 1.9
+times as much of a press as it is, and at most 0.51 times of a turned, mirrored or swapped one."""
 
 RECOLOURED = 0.035
 """Median difference that a change of the background's colours leaves at most: other gamma, saturation or stray light leave up to
@@ -123,7 +126,7 @@ class Views:
             if _median(left) < NEAR:  # most views end here
                 undone, same = _median(left[deciding]), _median(as_it_is[deciding])
                 view = OtherView(what, undone, same)
-                if undone >= min(NEAR, same):
+                if undone >= min(NEAR, BETTER * same):
                     continue
                 if not view.cropped or self._recoloured(seen, deciding) > min(undone, RECOLOURED):
                     found.append(view)

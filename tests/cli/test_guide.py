@@ -17,7 +17,7 @@ from torchvts.stream.background import is_touched
 
 BALL_MM = 5.0
 PLACES_MM = ((0, 0), (-4, -2), (4, 2))
-UNTIL_DEG = 3.9
+UNTIL_DEG = 3.3
 """Between the 4.1 degrees that one press of these states, and the 3.8 that two do."""
 
 STILL = 13

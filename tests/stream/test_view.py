@@ -77,8 +77,9 @@ def test_poses_are_seen_in_the_live_view(press, run_script, tmp_path, monkeypatc
     assert not sys.platform.startswith("linux") or (done.returncode == 2 and "--view: expected a screen" in done.stderr)
 
 
-def test_a_view_without_a_screen_writes_what_rerun_reads(press, run_script, tmp_path):
+def test_a_view_without_a_screen_writes_what_rerun_reads(press, run_script, tmp_path, monkeypatch):
     pytest.importorskip("rerun")
+    monkeypatch.setattr("torchvts.viz.MOST_POINTS", 160)
     done = run_script("view", *press, "--save", tmp_path / "ball.rrd")
     assert done.returncode == 0, done.stderr
     assert "18 frames, 0 dropped" in done.stdout and "rerun " in done.stdout

@@ -8,7 +8,7 @@ exact inverses of one discrete operator.
 import torch
 from torch import Tensor, nn
 
-from ..core.checks import check_batch, check_positive, has_memory
+from ..core.checks import check_batch, check_integer, check_numbers, check_positive, has_memory
 from ..core.precision import widened
 from .base import Integrator
 from .transforms import cosine_tables, matrices, reordering, sine_basis, solve_by_fft, solve_by_matrices
@@ -138,7 +138,9 @@ class PoissonDCT(Integrator):
         super().__init__()
         self.mm_per_pixel = check_positive("mm_per_pixel", mm_per_pixel)
         self.zero_in_background = False
-        self._plan: list[Tensor] = plan_dct(torch.zeros(1, dtype=torch.float64), *size)
+        check_numbers("size", size, (2,))
+        height, width = (check_integer("size", number, 2) for number in size)
+        self._plan: list[Tensor] = plan_dct(torch.zeros(1, dtype=torch.float64), height, width)
 
     def forward(self, gradient: Tensor) -> Tensor:
         check_gradient(gradient, 2)

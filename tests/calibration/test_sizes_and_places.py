@@ -11,6 +11,7 @@ import torchvts as vts
 from lab.drawn_sensors import drawn_sensor
 from torchvts.calibration import CalibrationWarning
 from torchvts.model import press_next, stated_error_deg
+from torchvts.scenes import objects
 
 
 def drawn():
@@ -159,7 +160,8 @@ def slopes_over_true(calibration, press):
 def test_balls_that_are_shallow_or_tiny_teach_the_slopes_of_larger_objects(diameter, depth):
     """The former show no steep skin, and blur takes from the rims of both."""
     unit = drawn_sensor(0)
-    ratio = slopes_over_true(by_balls(unit, diameter, depth), unit.objects[3])
+    pressed = unit.press(objects.capsule(1.5, 4.0), objects.pose(20.0, (1.0, 1.0), 0.6))
+    ratio = slopes_over_true(by_balls(unit, diameter, depth), pressed)
     assert 0.75 < ratio < 1.45
 
 
@@ -170,7 +172,7 @@ def test_presses_in_another_gamma_are_named_and_make_bounds_wider(whole):
     with pytest.warns(CalibrationWarning, match="light differs from the background's by .*another gamma"):
         calibration = vts.calibrate(unit.background, unit.sensor, presses)
     assert calibration.metric and calibration.report["uneven"] > 2.0 * whole[0].report["uneven"]
-    press, bounds = unit.objects[0], []
+    press, bounds = unit.press(objects.capsule(1.5, 4.0), objects.pose(20.0, (1.0, 1.0), 0.6)), []
     for one in (whole[0], calibration):
         with torch.no_grad():
             out = vts.ConfidentPipeline.from_calibration(one, "fast")(press.image[None])

@@ -93,9 +93,10 @@ class ZeroBackground(nn.Module):
         by_pressure = pressure_of_waves(k, m, (height, width), pitch_mm, self.decay_mm, depth)
         pressure = depth - (self.decay_mm / pitch_mm) ** 2 * laplacian(depth[:, None])[:, 0]
         reach = (depth.amax(dim=(1, 2), keepdim=True) - depth.amin(dim=(1, 2), keepdim=True)).clamp_min(1e-9)
-        free = weight < 0.1
-        any_free = free.flatten(1).any(dim=1)
-        start = -lower_eighth(depth.flatten(1), free.flatten(1))
+        free, flat = (weight < 0.1).flatten(1), depth.flatten(1)
+        any_free = free.any(dim=1)
+        # free cells may be faces of an object; no skin lies below the undeformed
+        start = -torch.minimum(lower_part(flat, free, 4), lower_part(flat, any_free[:, None].expand_as(free), 8))
         z = depth + start[:, :, None]
         unchanged = (1.0 - weight) / (1.0 + (z / (self.face * reach)).square()).square()
         pit = self.pit * weight * (-z / (self.pit_share * reach) - 1.0).clamp(0.0, 1.0)
@@ -150,8 +151,8 @@ def wave_numbers(terms: int, length: float, like: Tensor) -> Tensor:
     return math.pi / length * torch.arange(terms, dtype=like.dtype, device=like.device)
 
 
-def lower_eighth(values: Tensor, some: Tensor) -> Tensor:
-    """Lower eighth of some of the values (B, N), (B, 1); the least of all where there are none."""
+def lower_part(values: Tensor, some: Tensor, part: int) -> Tensor:
+    """Value below which one part in so many of some values (B, N) lies, (B, 1); the least of all where there are none."""
     count = some.sum(dim=1, keepdim=True)
     ordered = torch.where(some | (count == 0), values, torch.inf).sort(dim=1).values
-    return ordered.gather(1, count // 8)
+    return ordered.gather(1, count // part)

@@ -59,14 +59,16 @@ static void find_pressure(const Work *at, double decay) {
         }
 }
 
-/* The lower eighth of depth where it is free, negative: how the offset starts, below faces of the object. some: 2 n floats. */
+/* How the offset starts, negative: the lower quartile of free depth, which may be a face of the object, or the lower eighth of all, if that is
+   lower; the lowest where nothing is free. some: 2 n floats. */
 static double start_of(const Work *at, float *some, int *any_free) {
-    int count = 0, all;
+    int count = 0;
     for (int k = 0; k < at->n; k++)
         if (at->weight[k] < 0.1) some[count++] = (float)at->depth[k];
-    *any_free = count > 0, all = count ? count : at->n;
-    for (int k = 0; k < at->n && !count; k++) some[k] = (float)at->depth[k];
-    return -(double)sorted(some, some + all, all)[count / 8];
+    *any_free = count > 0;
+    const float free = count ? sorted(some, some + count, count)[count / 4] : INFINITY;
+    for (int k = 0; k < at->n; k++) some[k] = (float)at->depth[k];
+    return -(double)fminf(free, sorted(some, some + at->n, at->n)[count ? at->n / 8 : 0]);
 }
 
 /* result (lines, width) += factors (lines, n) times values (n, width), four values at a time, which spares memory. */

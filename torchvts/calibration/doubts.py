@@ -8,7 +8,6 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ..compensate.light import UNEVEN
 from ..core.arrays import array_of
 from ..core.levels import SATURATED
 from ..core.views import Views
@@ -35,6 +34,9 @@ MOST_DOUBTED = 1 / 3
 
 DISAGREEING = 4.0
 """So many standard deviations of a mean square about the usual one, which is sqrt(2 / N) of N presses, and presses disagree."""
+
+UNEVEN_PRESSES = 0.03
+"""Unevenness that the light of all presses has in common from which it is named; a press alone makes 0.024 in the median."""
 
 RIM_SINE = 0.7
 """Part of a ball's sine that is left at the rim of its contact: about the middle of its fall."""
@@ -82,7 +84,7 @@ def of_presses(contacts: Sequence[Contact], field: ResponseField, pitch_mm: floa
     """
     good = used(contacts)
     uneven = uneven_light(good)
-    other = [Doubt(_other_light(uneven))] if uneven > 0.5 * UNEVEN else []
+    other = [Doubt(_other_light(uneven))] if uneven > UNEVEN_PRESSES else []
     found = other + [Doubt(f"{contact.name}: left out: {contact.reason}") for contact in contacts if contact.reason]
     found += [Doubt(f"{contact.name}: {contact.doubt}") for contact in good if contact.doubt]
     found += _sizes_by_each_other(good) + _directions(field, good)
@@ -91,7 +93,7 @@ def of_presses(contacts: Sequence[Contact], field: ResponseField, pitch_mm: floa
 
 def _other_light(uneven: float) -> str:
     return (
-        f"presses: their light differs from the background's by {uneven:.0%} unevenly (usual: less than {0.5 * UNEVEN:.0%}): "
+        f"presses: their light differs from the background's by {uneven:.0%} unevenly (usual: less than {UNEVEN_PRESSES:.0%}): "
         "another gamma, saturation or white balance of the camera: take background, presses and frames with the same settings"
     )
 

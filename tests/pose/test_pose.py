@@ -222,6 +222,20 @@ def test_the_whole_chain_keeps_within_its_goal():
     assert pose_bench.pose_table(rows).count("\n") == 4 and set(shown) == set(targets)
 
 
+@pytest.mark.long
+@pytest.mark.parametrize("name", ["textured patch", "key"])
+def test_the_covariance_of_a_pose_predicts_its_error(name):
+    lights, pipe = pose_bench.rig(*SIZE, PITCH)
+    squares = []
+    for seed in range(8):
+        case = pose_bench.pose_case(objects.TARGETS[name], seed, lights, pipe, SIZE, 0.01)
+        found = vts.register_depth(case.source, case.target, PITCH)
+        off = found.T_target_source @ invert(case.T_sensor_target @ invert(case.T_sensor_source))
+        twist = torch.stack((off[2, 1], off[0, 2], off[1, 0], *off[:3, 3])).double()
+        squares.append(float(twist @ torch.linalg.solve(found.covariance.double(), twist)) / 6.0)
+    assert 0.25 < sum(squares) / len(squares) < 4.0, squares  # 1 expected
+
+
 # clouds
 
 

@@ -2,7 +2,7 @@
 
     python examples/export_cpp.py
 
-docs/export.md has the program of libtorch that loads it, the other formats, and their limits.
+docs/export.md has the other formats, and their limits; libtorch loads this one.
 """
 
 from pathlib import Path

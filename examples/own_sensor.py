@@ -2,7 +2,7 @@
 
     python examples/own_sensor.py
 
-The images are drawn: take your own in their place. docs/own_sensor.md has all keys of a sensor file, and what to record.
+The images are drawn: take your own in their place. docs/own_sensor.md has the keys of a sensor file.
 """
 
 from pathlib import Path

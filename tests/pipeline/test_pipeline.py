@@ -271,7 +271,7 @@ class Restless(NormalModel):
 
 
 @pytest.mark.filterwarnings("ignore::torch.jit.TracerWarning", "ignore:.torch.jit.trace:DeprecationWarning")
-@pytest.mark.parametrize("mode", ["fast", "precise"])
+@pytest.mark.parametrize("mode", ["precise", pytest.param("fast", marks=pytest.mark.long)])
 def test_a_traced_response_field_gives_the_same_depth_at_once(mode, mini_by_prior, mini_presses):
     """It ended in an internal error of PyTorch, by an optional buffer, then in tables that the first call alone made."""
     pipe = vts.DepthPipeline.from_calibration(mini_by_prior, mode)

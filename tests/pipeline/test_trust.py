@@ -76,7 +76,7 @@ def _derivatives(module: torch.nn.Module, image: Tensor) -> list[Callable[[], ob
     ]
 
 
-@pytest.mark.parametrize("mode", ["fast", "precise"])
+@pytest.mark.parametrize("mode", ["precise", pytest.param("fast", marks=pytest.mark.long)])
 def test_transforms_leave_a_pipeline_as_it_was(mode: str) -> None:
     image = press()
     pipe = vts.DepthPipeline.from_calibration(rig(), mode)

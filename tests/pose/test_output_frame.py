@@ -55,12 +55,11 @@ def test_points_poses_and_covariances_are_those_of_the_robot():
 
 def test_clouds_of_a_data_set(places, run_script):
     vts.write_image(places / "3.png", tiny_image(3))
-    for name, options in (("beside", ()), ("on", ("--unit", "m"))):
-        for kind in ("ply", "obj"):
-            out = places / f"{name}_{kind}"
-            given = (places / f"{name}.safetensors", places / "3.png", "--out", out, "--no-pictures", "--cloud", kind)
-            done = run_script("reconstruct", *given, *options)
-            assert done.returncode == 0, done.stderr
+    for name, kind, options in (("beside", "ply", ()), ("on", "ply", ("--unit", "m")), ("on", "obj", ("--unit", "m"))):
+        out = places / f"{name}_{kind}"
+        given = (places / f"{name}.safetensors", places / "3.png", "--out", out, "--no-pictures", "--cloud", kind)
+        done = run_script("reconstruct", *given, *options)
+        assert done.returncode == 0, done.stderr
     (_, points, normals), (says, there, turned) = (read_ply(places / f"{name}_ply" / "3.ply") for name in ("beside", "on"))
     assert says == "m, axes of the robot" == json.loads((places / "on_ply" / "summary.json").read_text())["clouds"]
     turn, shift = MOUNT[:3, :3].numpy(), MOUNT[:3, 3].numpy()

@@ -49,4 +49,4 @@ def test_a_dot_without_darkness_is_gone():
 
 def test_a_drag_that_folds_the_skin_is_refused():
     with pytest.raises(ValueError, match="drag: expected skin that does not fold"):
-        DottedSkin(**SIZE).image(Drag(radius_mm=1.0, shift_mm=(3.0, 0.0), reach_mm=0.5))
+        DottedSkin(**SIZE | {"height": 24, "width": 32}).image(Drag(radius_mm=1.0, shift_mm=(3.0, 0.0), reach_mm=0.5))

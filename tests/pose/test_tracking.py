@@ -690,13 +690,13 @@ def test_a_frame_before_lift_off_is_followed_and_no_more_certain_than_it_is_righ
 def test_heights_show_the_tilt_that_wrong_slopes_hide():
     """Slopes alone give 0.33 degrees, median."""
     ((row, _),) = tracking.run_tracking(["gear"], ["fast"], ["slopes off by 3 degrees"], [4], [4])
-    assert float(np.median(row.each["deg"])) < 0.32 and row.each["lost"] == [] and row.each["wrong"] == []
+    assert float(np.median(row.each["deg"])) < 0.3 and row.each["lost"] == [] and row.each["wrong"] == []
 
 
 @pytest.mark.long
 def test_slopes_that_err_over_wide_areas_are_no_reason_for_confidence():
     ((row, track),) = tracking.run_tracking(["tool handle"], ["fast"], ["slopes off by 3 degrees"], [4], [4])
-    assert max(row.each["deg"]) > 0.4 and row.each["lost"] == [] and row.each["wrong"] == []
+    assert max(row.each["deg"]) > 0.5 and row.each["lost"] == [] and row.each["wrong"] == []
     tracker = vts.PoseTracker(track.frames[0], track.mm_per_pixel)
     for frame in track.frames[1:6]:
         found = tracker(frame)

@@ -88,7 +88,7 @@ def test_depth_counts_from_free_skin_whose_offset_is_smooth():
     drift = (0.05 + 0.01 * x - 0.02 * y)[None, None]
     found = ZeroBackground(0.1)(depth + drift, weight)
     assert (found - depth)[0, 0][r < 2.0].abs().max() < 0.08
-    assert found[0, 0][r > 5.5].abs().max() < 0.065
+    assert found[0, 0][r > 5.5].abs().max() < 0.06
 
 
 def test_without_free_skin_the_lowest_depth_is_zero():

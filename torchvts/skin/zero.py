@@ -16,7 +16,7 @@ ZERO_CELLS = 30
 WAVES = 8
 """Cosine terms along the shorter side of which the offset is made."""
 
-DECAY_MM = 2.0
+DECAY_MM = 1.5
 """L, the length on which free skin decays."""
 
 SMOOTH_MM = 0.35

@@ -86,10 +86,6 @@ TABLE = {
     "objects.sphere": Entry({"radius_mm": 10.0}, {"radius_mm": NUMBER}),
     "objects.cylinder": Entry({"radius_mm": 6.0}, {"radius_mm": NUMBER}),
     # ---- export ----
-    "export.PoissonBackgroundByMatrix": Entry(SIZE, {}),
-    "export.PoissonBackgroundByMatrix.forward": Entry({"gradient": torch.zeros(1, 2, HEIGHT, WIDTH)},
-        {"gradient": [*batches(2), torch.zeros(1, 2, 8, 8)]},
-        lambda: torchvts.export.PoissonBackgroundByMatrix(HEIGHT, WIDTH, 1.0)),
     "export.describe": Entry({"pipe": pipe(), "rectify": None}, {"pipe": [None, unit(), "pipeline.pt"]}),
     **{f"export.{name}": Entry({"pipe": pipe(), "path": ..., "rectify": vts.Rectify(sensor())},
         {"pipe": [None, unit(), "pipeline.pt"], "path": [Path("no/such.pt2"), "."]}, file=("path",), run=False)

@@ -1,6 +1,5 @@
 """Accepted and refused arguments of gs_sdk's formats, scenes, objects, export and stream: a table for test_refusals."""
 
-from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -103,9 +102,9 @@ TABLE = {
         file=("path",), named={"name": "format"}, run=False),
     # ---- stream ----
     "stream.FrameCheck": Entry({"background": image()}, {"background": [b for k, b in enumerate(images()) if k not in (3, 4)]}),
-    "stream.Recording": Entry({"calibration": unit(), "mode": "fast", "first": None, "stage": nullcontext}
+    "stream.Recording": Entry({"calibration": unit(), "mode": "fast", "first": None}
         | {"network": None, "device": "cpu", "contact": None},
-        {"calibration": [None, "unit"], "mode": ["slow"], "first": [], "stage": []}
+        {"calibration": [None, "unit"], "mode": ["slow"], "first": []}
         | {"network": [], "device": [None, "gpu", "cuda:99"], "contact": ["4.5", 4.5]}),
     "stream.StreamReport": Entry({"stream": ...}, {"stream": [None, "camera"]}, run=False),
     "stream.TactileStream": Entry({"source": ..., "sensor_or_calibration": sensor(), "mode": "fast", "background_frames": 12,

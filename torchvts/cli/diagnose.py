@@ -99,7 +99,8 @@ def of_recording(arguments: argparse.Namespace, background: Tensor | None, calib
     if arguments.json:
         print(json.dumps({"ok": clean == count, "frames": count, "of": total, "findings": rows}, indent=1))
         return 0 if clean == count else 1
-    print(f"{count if every == 1 else f'{count} of {total}'} frames: {clean} without a warning or a fault")
+    looked = f"{count} frames" if every == 1 else f"{count} of {total} frames"
+    print(f"{looked}: {clean} without a warning or a fault")
     for row in rows:
         shares = ", ".join(f"{severity} in {n}" for severity, n in row["severities"].items())
         print(f"{shares} of {count}, such as {row['frames'][0]}: {row['message']} [{row['name']}]")

@@ -50,7 +50,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Find the poses, write pose.json, and print them."""
-    clouds, names = [path.suffix.lower() in CLOUD_SUFFIXES for path in arguments.files], ", ".join(map(str, arguments.files))
+    clouds = [path.suffix.lower() in CLOUD_SUFFIXES for path in arguments.files]
+    names = ", ".join(map(str, arguments.files))
     if any(clouds) and (not all(clouds) or len(clouds) != 2):
         raise UsageError(f"expected two clouds and nothing beside them, got {names}")
     if not any(clouds) and len(clouds) != 3:

@@ -81,14 +81,15 @@ class _Viewing:
             if key == "z":
                 self.stream.rezero()
                 print(f"frame {frame.number}: the next frames are the new zero")
-            elif key in "sr":
-                make_folder(self.out)
-                (self.snapshot if key == "s" else self.record)(frame)
+            elif key == "s":
+                self.snapshot(frame)
+            elif key == "r":
+                self.record(frame)
         return True
 
     def snapshot(self, frame: TactileFrame) -> None:
         """Write the frame as npz and as a picture."""
-        path, sensor = self.out / f"frame_{frame.number:06}.npz", self.stream.calibration.sensor
+        path, sensor = make_folder(self.out) / f"frame_{frame.number:06}.npz", self.stream.calibration.sensor
         metric, doubts, doubt = self.stream.metric, self.stream.calibration.report.get("doubts", []), self.stream.doubt
         write_result(path, frame.output, Facts(sensor.mm_per_pixel, "", sensor.name, metric, doubts), str(frame.number), doubt)
         title, said = f"{sensor.name}, {frame.time_s:.2f} s", [f"IN DOUBT: {doubt}"] if doubt else []
@@ -106,6 +107,6 @@ class _Viewing:
             self.view.record(None)
             print(f"wrote {running}")
             return
-        path = self.out / f"from_{frame.number:06}.rrd"
+        path = make_folder(self.out) / f"from_{frame.number:06}.rrd"
         self.view.record(path)
         print(f"recording to {path}")

@@ -113,11 +113,13 @@ class Worker:
 
     def _depth(self, frame: Entry) -> tuple[Entry, DepthOutput | None, str]:
         """A frame, its depth, and why less may have been seen in it than is there; or a frame that says why there is none."""
-        recording, image = frame.recording or self.image, frame.image
+        if frame.image is None:
+            return frame, None, ""
+        recording = frame.recording or self.image
         try:
-            if image is None or (reason := recording.unusable(image)):
-                return frame if image is None else frame._replace(failed=reason), None, ""
-            return frame, recording(image), recording.doubt
+            if reason := recording.unusable(frame.image):
+                raise ValueError(reason)
+            return frame, recording(frame.image), recording.doubt
         except ValueError as error:
             return frame._replace(failed=in_one_line(error)), None, ""
 

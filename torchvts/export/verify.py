@@ -92,14 +92,15 @@ def export_checked(pipe: DepthPipeline, folder: str | Path, formats: Sequence[st
 
 
 def _export_one(pipe: DepthPipeline, folder: Path, name: str, images: Tensor) -> ExportCheck:
-    path, tolerance_mm, difference, reason = folder / FORMATS[name].file_name, FORMATS[name].tolerance_mm, math.nan, ""
+    form, difference, reason = FORMATS[name], math.nan, ""
+    path = folder / form.file_name
     try:
-        FORMATS[name].write(pipe, path)
+        form.write(pipe, path)
         difference = compare(path, pipe, images, name)
     except Exception as error:
         reason = (str(error).strip() or type(error).__name__).splitlines()[0]
-    if difference > tolerance_mm:
-        reason = f"depth is {difference:.3g} mm off, at most {tolerance_mm:g} is allowed"
+    if difference > form.tolerance_mm:
+        reason = f"depth is {difference:.3g} mm off, at most {form.tolerance_mm:g} is allowed"
     return ExportCheck(name, path, path.stat().st_size / 1024 if path.is_file() else math.nan, difference, reason)
 
 

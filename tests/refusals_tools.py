@@ -1,6 +1,5 @@
 """Accepted and refused arguments of gs_sdk's formats, scenes, objects, export and stream: a table for test_refusals."""
 
-from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -86,10 +85,6 @@ TABLE = {
     "objects.sphere": Entry({"radius_mm": 10.0}, {"radius_mm": NUMBER}),
     "objects.cylinder": Entry({"radius_mm": 6.0}, {"radius_mm": NUMBER}),
     # ---- export ----
-    "export.PoissonBackgroundByMatrix": Entry(SIZE, {}),
-    "export.PoissonBackgroundByMatrix.forward": Entry({"gradient": torch.zeros(1, 2, HEIGHT, WIDTH)},
-        {"gradient": [*batches(2), torch.zeros(1, 2, 8, 8)]},
-        lambda: torchvts.export.PoissonBackgroundByMatrix(HEIGHT, WIDTH, 1.0)),
     "export.describe": Entry({"pipe": pipe(), "rectify": None}, {"pipe": [None, unit(), "pipeline.pt"]}),
     **{f"export.{name}": Entry({"pipe": pipe(), "path": ..., "rectify": vts.Rectify(sensor())},
         {"pipe": [None, unit(), "pipeline.pt"], "path": [Path("no/such.pt2"), "."]}, file=("path",), run=False)
@@ -107,9 +102,9 @@ TABLE = {
         file=("path",), named={"name": "format"}, run=False),
     # ---- stream ----
     "stream.FrameCheck": Entry({"background": image()}, {"background": [b for k, b in enumerate(images()) if k not in (3, 4)]}),
-    "stream.Recording": Entry({"calibration": unit(), "mode": "fast", "first": None, "stage": nullcontext}
+    "stream.Recording": Entry({"calibration": unit(), "mode": "fast", "first": None}
         | {"network": None, "device": "cpu", "contact": None},
-        {"calibration": [None, "unit"], "mode": ["slow"], "first": [], "stage": []}
+        {"calibration": [None, "unit"], "mode": ["slow"], "first": []}
         | {"network": [], "device": [None, "gpu", "cuda:99"], "contact": ["4.5", 4.5]}),
     "stream.StreamReport": Entry({"stream": ...}, {"stream": [None, "camera"]}, run=False),
     "stream.TactileStream": Entry({"source": ..., "sensor_or_calibration": sensor(), "mode": "fast", "background_frames": 12,

@@ -175,15 +175,12 @@ TRIGGERS = {
     "dots_shifted": dotted(lambda skin: (scenes.Drag(radius_mm=60.0, shift_mm=(0.2, -0.1)), None)),
     # the scene
     "no_contact": gallery("faint contact", 0.0),
-    "contact_covers_image": gallery("covers the image", 1.0),
     "contact_at_border": gallery("cut by the border", 8.0),
-    "faint_contact": gallery("faint contact", 0.05),
     "steep_walls": gallery("steep walls", 4.0),
     "steep_walls, cut ends": gallery("cut ends", 3.0),
     "beyond_presses": little_known,
     "shadow": gallery("attached shadows", 30.0),
     "cast_shadow": gallery("cast shadows", 30.0),
-    "deep_press": gallery("deeper press", 3.0),
 }
 """Name of a finding, and after a comma what makes it -> the frame that triggers it."""
 
@@ -402,7 +399,7 @@ def test_reconstruct_gives_a_finding_as_the_worst_of_its_frames(tmp_path):
     for k, noise_std in enumerate((0.012, 0.1)):
         noise = noise_std * torch.randn(case.image[0].shape, generator=torch.Generator().manual_seed(k))
         vts.write_image(tmp_path / f"{k}.png", (case.image[0] + noise).clamp(0.0, 1.0))
-    findings = diagnose_some(case.calibration, [tmp_path], RunReport(0, 2, 0, [], 0.0), 1)
+    findings = diagnose_some(case.calibration, [tmp_path], RunReport(0, 2, 0, []), 1)
     assert [(name, finding.severity) for name, finding in findings if finding.name == "noise"] == [("1.png and 1 more", "fault")]
 
 

@@ -13,6 +13,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 import torchvts as vts
 from torchvts import export
 from torchvts.export import onnx_operators
+from torchvts.export.trace import PoissonBackgroundByMatrix
 
 HEIGHT, WIDTH, PITCH = 48, 64, 0.6
 SENSOR = vts.Sensor("rig", HEIGHT, WIDTH, PITCH)
@@ -247,7 +248,7 @@ def test_files_run_without_torchvts(low, mini, tmp_path, name, kind):
 def test_matrix_products_integrate_as_the_pipeline_does(height, width, zero_in_background):
     gradient = torch.randn(3, 2, height, width, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     gradient[1:, :, :8] = 0.0
-    by_matrix = export.PoissonBackgroundByMatrix(height, width, 0.3, torch.float64, zero_in_background)(gradient)
+    by_matrix = PoissonBackgroundByMatrix(height, width, 0.3, torch.float64, zero_in_background)(gradient)
     expected = (vts.PoissonBackground if zero_in_background else vts.PoissonDCT)(0.3)(gradient)
     assert (by_matrix - expected).abs().max() < 1e-12
 

@@ -55,9 +55,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--force", action="store_true", help="go on where presses contradict all sizes")
     parser.add_argument("--no-prior", action="store_true", help="ignore the prior of the sensor file")
     add_background_frames(parser)
-    parser.add_argument(
-        "--out", type=Path, default=Path("unit.safetensors"), metavar="FILE", help="calibration to write (unit.safetensors)"
-    )
+    out = Path("unit.safetensors")
+    parser.add_argument("--out", type=Path, default=out, metavar="FILE", help=f"calibration to write ({out})")
     parser.add_argument("--candidates", action="store_true", help="also print all models and presses")
 
 
@@ -67,7 +66,9 @@ def run(arguments: argparse.Namespace) -> int:
         raise UsageError(f"expected either --sensor or --mm-per-pixel; shipped sensors: {', '.join(shipped_sensors())}")
     if arguments.sensor is not None and arguments.gamma is not None:
         raise UsageError("--gamma: expected it beside --mm-per-pixel, --sensor has the file's: write gamma into the sensor file")
-    check_target_of(arguments.out)
+    if arguments.out.suffix != ".safetensors":
+        raise UsageError(f"--out: expected a name ending in .safetensors, got {arguments.out}")
+    check_folder(arguments.out.parent)
     picture = arguments.out.with_name(f"{arguments.out.stem}_calibration.png")  # not the name of a background
     if arguments.camera is not None:
         return by_hand(arguments, picture)
@@ -118,13 +119,6 @@ def write(calibration: Calibration, presses: Sequence[Press], arguments: argpars
     print(f"wrote {arguments.out} ({arguments.out.stat().st_size / 1000:.0f} kB), and {picture}: what it was made of")
     step = f"torchvts reconstruct {arguments.out} IMAGE --out FOLDER, or torchvts view {arguments.out} 0 for a camera, live"
     return ended(calibration.metric, False, step)
-
-
-def check_target_of(out: Path) -> None:
-    """Refuse a name that is no calibration's before the work that leads to it."""
-    if out.suffix != ".safetensors":
-        raise UsageError(f"--out: expected a name ending in .safetensors, got {out}")
-    check_folder(out.parent)
 
 
 def read_given(arguments: argparse.Namespace) -> tuple[Tensor, Sensor, list[Press]]:

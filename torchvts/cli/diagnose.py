@@ -47,12 +47,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Print the findings."""
     calibration, now = load_calibration(arguments.calibration), arguments.background
-    if now is None:
-        background = None
-    elif is_film(now):
-        background = read_background([now], calibration.sensor)
-    else:
-        background = cut(read_image(now), calibration)
+    background = None
+    if now is not None:
+        background = read_background([now], calibration.sensor) if is_film(now) else cut(read_image(now), calibration)
     if arguments.image.is_dir() or is_film(arguments.image):
         return of_recording(arguments, background, calibration)
     diagnosis = diagnose(background, cut(read_image(arguments.image), calibration), calibration)
@@ -65,11 +62,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def cut(image: Tensor, calibration: Calibration) -> Tensor:
-    """A frame as ``torchvts reconstruct`` cuts it; one of another size stays, and is a finding.
-
-    Raises:
-        ValueError: it seems to be cut already.
-    """
+    """A frame as ``torchvts reconstruct`` cuts it; one of another size stays, and is a finding."""
     try:
         return calibration.sensor.rectify(image[None])[0]
     except ValueError:

@@ -17,7 +17,7 @@ import torch
 from .. import export
 from ..pipeline import unit_pipeline
 from ..stream import frames
-from .options import add_mode, add_network, add_out, load_calibration
+from .options import add_model, add_out, load_calibration
 
 USAGE = "CALIBRATION --out FOLDER [--format NAME...] [--mode MODE]"
 
@@ -26,8 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the subcommand."""
     parser.add_argument("calibration", type=Path, metavar="CALIBRATION", help="what torchvts calibrate wrote, .safetensors")
     add_out(parser, "for the files")
-    add_mode(parser, "fast")
-    add_network(parser)
+    add_model(parser)
     usual = [name for name in export.FORMATS if name != "plan"]
     names = f"{', '.join(usual)} (all three), or plan: for C and web pages"
     parser.add_argument("--format", nargs="+", default=usual, metavar="NAME", help=names)

@@ -1,7 +1,6 @@
 """Calibration by hand: a camera watches, sentences say what to do, and the background and each press lie in a folder at once."""
 
 import csv
-import io
 import itertools
 from collections import deque
 from pathlib import Path
@@ -20,33 +19,24 @@ from ..stream import FIRST_FRAMES, Unreadable, find_background
 from ..stream.background import check_steady, is_touched
 from ..stream.sources import NumberedFrame
 from ..viz import calibration_figure, save_figure
-from .options import calibrated, read_folder, working
+from .options import calibrated, read_folder
 
 
 class Session:
     """Background and presses of a unit as they come, in a folder of gs_sdk's layout; what lies there already is gone on with.
 
-    A press that was refused stays as an image and leaves the catalog, and so does not count.
-
-    Args:
-        folder: made, where it is missing, with the background.
-        sensor: cuts the images of the folder.
-    Attributes:
-        background: (3, H, W), rectified; None until there is one.
-        presses: of the catalog, rectified.
-    Raises:
-        ValueError: as :func:`~torchvts.model.gs_sdk.read_calibration_folder`.
+    ``background`` (3, H, W), None until there is one, and ``presses`` are rectified. A press that was refused stays as an image and
+    leaves the catalog, and so does not count.
     """
 
     def __init__(self, folder: Path, sensor: Sensor) -> None:
         self.folder, self.sensor = check_folder(folder), sensor
         self.background: Tensor | None = None
-        self.presses: list[Press] = []
         self.read()
 
     def read(self) -> None:
         """Read what lies in the folder."""
-        self.presses = []
+        self.presses: list[Press] = []
         if (self.folder / "catalog.csv").is_file():
             self.background, self.presses = read_folder(self.folder, self.sensor)
         elif (self.folder / "background.png").is_file():
@@ -61,21 +51,17 @@ class Session:
         """Keep a press, the next of the catalog."""
         name = next(str(k) for k in itertools.count(1) if not (self.folder / str(k)).exists())
         _write_png(make_folder(self.folder / name) / "gelsight.png", image)
-        self._write_catalog([*self._rows(), (name, f"{ball_diameter_mm:g}")])
+        self._write_catalog({press.name: press.ball_diameter_mm for press in self.presses} | {name: ball_diameter_mm})
 
     def leave_out(self, name: str) -> None:
         """Take a press out of the catalog."""
-        self._write_catalog([row for row in self._rows() if row[0] != name])
+        self._write_catalog({press.name: press.ball_diameter_mm for press in self.presses if press.name != name})
 
-    def _rows(self) -> list[tuple[str, str]]:
-        return [(press.name, f"{press.ball_diameter_mm:g}") for press in self.presses]
-
-    def _write_catalog(self, rows: list[tuple[str, str]]) -> None:
-        text = io.StringIO()
-        csv.writer(text, lineterminator="\n").writerows([CATALOG_COLUMNS, *rows])
-        if rows:
-            with write_atomically(self.folder / "catalog.csv") as temporary:
-                temporary.write_text(text.getvalue(), encoding="utf-8")
+    def _write_catalog(self, diameters_mm: dict[str, float]) -> None:
+        rows = [CATALOG_COLUMNS, *((name, f"{diameter_mm:g}") for name, diameter_mm in diameters_mm.items())]
+        if diameters_mm:
+            with write_atomically(self.folder / "catalog.csv") as temporary, open(temporary, "w", newline="") as file:
+                csv.writer(file, lineterminator="\n").writerows(rows)
         else:  # which would be none
             (self.folder / "catalog.csv").unlink()
         self.read()
@@ -87,11 +73,7 @@ def _write_png(path: Path, image: Tensor) -> None:
 
 
 class Watch:
-    """The last :data:`~torchvts.stream.FIRST_FRAMES` frames: are they still, is the skin touched, and one picture of them.
-
-    Args:
-        sensor: rectifies.
-    """
+    """The last :data:`~torchvts.stream.FIRST_FRAMES` frames: are they still, is the skin touched, and one picture of them."""
 
     def __init__(self, sensor: Sensor) -> None:
         self.sensor = sensor
@@ -115,10 +97,9 @@ class Watch:
 
     def why_not_at_rest(self) -> str:
         """Why the frames are not those of still, untouched skin; "" where they are."""
-        if len(self._rectified) < FIRST_FRAMES:
-            return f"keep the sensor still, and off everything, for {FIRST_FRAMES} frames"
         if self.moves():
-            return "something moves, or the light changes: keep the sensor still, and off everything"
+            few = len(self._rectified) < FIRST_FRAMES
+            return f"{'' if few else 'something moves, or the light changes: '}keep the sensor still, and off everything"
         try:
             find_background(torch.stack(list(self._rectified)), self.sensor)
         except ValueError:
@@ -136,24 +117,15 @@ class Watch:
 
 
 def draw(unit: Calibration, presses: list[Press], picture: Path) -> None:
-    """Draw what a calibration was made of; a line says so meanwhile."""
+    """Draw what a calibration was made of."""
     make_folder(picture.parent)
-    with working(f"drawing {picture.name}"):
-        save_figure(calibration_figure(unit, presses), picture)
+    save_figure(calibration_figure(unit, presses), picture)
 
 
 class Guide:
     """What is said and done at each frame, until the calibration states the error that was asked for.
 
-    Args:
-        session: holds what was taken.
-        watch: over the frames.
-        ball_diameter_mm: of the ball of this session.
-        until_deg: mean error of normals to reach.
-        picture: written after each press, with the circles that were found.
-        force: as of :func:`torchvts.calibrate`.
-    Attributes:
-        unit: calibration by the presses that were kept; None before the first.
+    ``picture`` is written after each press; ``unit`` is the calibration by the presses that were kept, None before the first.
     """
 
     def __init__(
@@ -184,7 +156,10 @@ class Guide:
         self.watch.add(pixels)
         background = self.session.background
         if background is None:
-            self._rest()
+            why = self.watch.why_not_at_rest()
+            if not why:
+                self.session.set_background(self.watch.picture())
+            self._say(why or "still and untouched: the background is taken")
         elif not self.watch.touched(background):
             self._lifted = True
             self._say(f"press the ball of {self.ball_diameter_mm:g} mm and hold it still: {self._where}")
@@ -195,14 +170,6 @@ class Guide:
             self.session.add(self.watch.picture(), self.ball_diameter_mm)
             self._judge()
         return not self.reached
-
-    def _rest(self) -> None:
-        why = self.watch.why_not_at_rest()
-        if why:
-            self._say(why)
-            return
-        self.session.set_background(self.watch.picture())
-        self._say("still and untouched: the background is taken")
 
     def _judge(self) -> None:
         """Calibrate by all presses of the session: the last one is kept, or refused with its reason, as may be those before it."""

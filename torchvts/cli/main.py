@@ -10,7 +10,6 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
-from typing import TextIO
 
 from ..core import __version__
 from ..core.checks import in_one_line
@@ -32,9 +31,7 @@ COMMANDS = {
 """Subcommand: what it does. Its module has its name; it is imported only where it is asked for."""
 
 FAILED, USAGE_OR_INPUT, BUG, INTERRUPTED = 1, 2, 70, 130
-"""Exit statuses: nobody reads the output; a request or an input that cannot be used; a bug in torchvts; Ctrl-C. A subcommand
-returns 0, or 1 where it did its job and something is wrong with the images: frames left out or in doubt, a fault, no pose,
-depth that is not metric."""
+"""Exit statuses, as docs/command.md explains them; FAILED also where nobody reads the output."""
 
 PACKAGE = f"{Path(__file__).parents[1]}{os.sep}"
 
@@ -56,13 +53,8 @@ torchvts COMMAND --help explains a command; torchvts --version prints the versio
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run a subcommand.
+    """Run a subcommand by the words after ``torchvts``, None for those of the process; returns the exit status.
 
-    Args:
-        argv: the words after ``torchvts``; None takes those of the process.
-    Returns:
-        The exit status: 0; 1 where something is wrong with the images (:data:`FAILED`); 2 for a wrong request or input; 70 for a
-        bug; 130 after Ctrl-C.
     Example:
         >>> main(["--version"])  # doctest: +ELLIPSIS
         torchvts ...
@@ -88,9 +80,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return FAILED
     except Exception as error:
+        text = in_one_line(error)
         if _is_refusal(error):
-            return _say(f"error: {in_one_line(error)}", USAGE_OR_INPUT, debug)
-        text = f"error: {type(error).__name__}: {in_one_line(error)}: a bug in torchvts: please report it with the lines above"
+            return _say(f"error: {text}", USAGE_OR_INPUT, debug)
+        text = f"error: {type(error).__name__}: {text}: a bug in torchvts: please report it with the lines above"
         return _say(text, BUG, debug=True)
 
 
@@ -113,9 +106,7 @@ def _run(words: list[str]) -> int:
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="backslashreplace")  # names of files may not be text
     module = importlib.import_module(f"{__package__}.{name}")
-    arguments = make_parser(name, module).parse_intermixed_args(words[1:])
-    status: int = module.run(arguments)
-    return status
+    return int(module.run(make_parser(name, module).parse_intermixed_args(words[1:])))
 
 
 def make_parser(name: str, module: ModuleType) -> Parser:
@@ -143,16 +134,9 @@ def _say(text: str, status: int, debug: bool) -> int:
 def _plain_warnings() -> Iterator[None]:
     """Warnings as one line each, without the place in the code that raised them."""
 
-    def show(
-        message: Warning | str,
-        category: type[Warning],
-        filename: str,
-        lineno: int,
-        file: TextIO | None = None,
-        line: str | None = None,
-    ) -> None:
+    def show(message: Warning | str, *_: object) -> None:
         print(f"torchvts: warning: {' '.join(str(message).split())}", file=sys.stderr)
 
     with warnings.catch_warnings():
-        warnings.showwarning = show
+        warnings.showwarning = show  # type: ignore[assignment]  # it takes what the warning's place is, and leaves it out
         yield

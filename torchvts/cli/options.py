@@ -4,27 +4,20 @@ import argparse
 import sys
 import warnings
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import NoReturn
 
 from torch import Tensor
-from tqdm import tqdm
 
 from ..calibration import CalibrationWarning, Press, calibrate, read_presses
-from ..core.checks import parse_number
 from ..core.containers import open_film
-from ..core.spelling import suggest
 from ..model import Calibration, Sensor, shipped_sensors
 from ..model.summary import NOT_METRIC
 from ..pipeline import MODES
 from ..pose.output_frame import MM_OF
-from ..skin import ContactSettings
 from ..stream import FIRST_FRAMES
 from ..training.presses import without_labels
 from .parser import UsageError
-
-_CONTACT = " ".join(f"{key}={'own' if value is None else format(value, 'g')}" for key, value in asdict(ContactSettings()).items())
 
 
 def add_sensor(parser: argparse._ActionsContainer, text: str = "") -> None:
@@ -43,12 +36,7 @@ def add_unit(parser: argparse._ActionsContainer, inputs: str, required: bool = T
 
 
 def split_files(arguments: argparse.Namespace) -> tuple[Sensor | Calibration, list[str]]:
-    """The unit and the inputs that the arguments of :func:`add_unit` name.
-
-    Raises:
-        UsageError: a calibration beside ``--sensor`` or behind the inputs, neither of both, no input, or what calibrates beside a
-            calibration.
-    """
+    """The unit and the inputs that the arguments of :func:`add_unit` name."""
     first, *inputs = arguments.files
     if arguments.sensor is not None:
         if first.endswith(".safetensors"):
@@ -67,66 +55,32 @@ def split_files(arguments: argparse.Namespace) -> tuple[Sensor | Calibration, li
 
 def add_press(parser: argparse._ActionsContainer) -> None:
     """``--press IMAGE DIAMETER_MM``, repeated."""
-    parser.add_argument(
-        "--press", nargs=2, action="append", default=[], metavar=("IMAGE", "MM"), help="a ball pressed in, and its diameter; repeat"
-    )
+    text = "a ball pressed in, and its diameter; repeat"
+    parser.add_argument("--press", nargs=2, action="append", default=[], metavar=("IMAGE", "MM"), help=text)
 
 
 def add_background_frames(parser: argparse._ActionsContainer) -> None:
     """``--background-frames N``, of a video."""
-    parser.add_argument(
-        "--background-frames",
-        type=int,
-        default=FIRST_FRAMES,
-        metavar="N",
-        help=f"first frames, without contact ({FIRST_FRAMES})",
-    )
+    text = f"first frames, without contact ({FIRST_FRAMES})"
+    parser.add_argument("--background-frames", type=int, default=FIRST_FRAMES, metavar="N", help=text)
 
 
-def add_mode(parser: argparse._ActionsContainer, default: str = "fast") -> None:
-    """``--mode``: of the pipeline."""
-    parser.add_argument("--mode", choices=MODES, default=default, metavar="MODE", help=f"{', '.join(MODES)} ({default})")
-
-
-def add_network(parser: argparse._ActionsContainer) -> None:
-    """``--network``: what finds the normals in place of the calibration's model."""
+def add_model(parser: argparse._ActionsContainer) -> None:
+    """``--mode`` of the pipeline, and ``--network`` in place of the calibration's model."""
+    parser.add_argument("--mode", choices=MODES, default="fast", metavar="MODE", help=f"{', '.join(MODES)} (fast)")
     parser.add_argument("--network", type=Path, metavar="FILE", help="nnmodel.pth of gs_sdk, or what torchvts train wrote")
 
 
 def add_pipeline(parser: argparse._ActionsContainer) -> None:
-    """``--mode``, ``--network``, ``--device`` and ``--contact KEY=VALUE``, thresholds for :func:`contact_of`."""
-    add_mode(parser)
-    add_network(parser)
+    """:func:`add_model`, and ``--device``."""
+    add_model(parser)
     parser.add_argument("--device", default="cpu", help="cpu, cuda, cuda:1 (cpu)")
-    parser.add_argument("--contact", nargs="+", metavar="KEY=VALUE", help=f"thresholds: {_CONTACT}")
-
-
-def contact_of(given: Sequence[str] | None) -> ContactSettings | None:
-    """The thresholds in ``--contact``; None where it was not given.
-
-    Example:
-        >>> contact_of(["sigmas=6"])
-        ContactSettings(sigmas=6.0, share=None, decay_mm=None)
-    """
-    if not given:
-        return None
-    values = {}
-    for text in given:
-        key, _, number = text.partition("=")
-        if key not in asdict(ContactSettings()):
-            raise UsageError(f"--contact: expected {_CONTACT}, got {text!r}{suggest(key, asdict(ContactSettings()))}")
-        try:
-            values[key] = parse_number(number)
-        except ValueError as error:
-            raise UsageError(f"--contact: {key}: {error}") from None
-    return ContactSettings(**values)
 
 
 def add_length_unit(parser: argparse._ActionsContainer) -> None:
     """``--unit``: of clouds and poses."""
-    parser.add_argument(
-        "--unit", dest="length_unit", choices=list(MM_OF), default="mm", help="of length in clouds and poses: mm (if not given), m"
-    )
+    text = "of length in clouds and poses: mm (if not given), m"
+    parser.add_argument("--unit", dest="length_unit", choices=list(MM_OF), default="mm", help=text)
 
 
 def load_sensor(name: str) -> Sensor:
@@ -175,11 +129,6 @@ def load_calibration(path: Path) -> Calibration:
 def add_out(parser: argparse._ActionsContainer, text: str) -> None:
     """``--out``: where results go."""
     parser.add_argument("--out", type=Path, metavar="FOLDER", required=True, help=text)
-
-
-def working(what: str) -> "tqdm[NoReturn]":
-    """For a ``with`` block that takes seconds: a line that says what it does, where a person looks on."""
-    return tqdm(desc=what, bar_format="{desc} ...", leave=False, disable=None)
 
 
 def ended(metric: bool, wrong: object, step: str = "") -> int:

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 from tqdm import tqdm
 
 from .. import viz
@@ -28,7 +29,7 @@ from ..pose import OutputFrame, contact_cloud, read_point_cloud, register_depth,
 from ..pose.clouds import CLOUD_SUFFIXES
 from ..pose.result import Registration
 from ..stream import Recording, frames
-from .options import add_length_unit, add_mode, add_network, add_out, ended, load_calibration
+from .options import add_length_unit, add_model, add_out, ended, load_calibration
 from .parser import UsageError
 
 USAGE = "CALIBRATION SOURCE REFERENCE --out FOLDER"
@@ -41,8 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the subcommand."""
     parser.add_argument("files", type=Path, nargs="+", metavar="FILE", help="calibration, source, reference; or two clouds")
     add_out(parser, "for pose.json and pictures")
-    add_mode(parser)
-    add_network(parser)
+    add_model(parser)
     parser.add_argument("--cloud", choices=["pcd", "ply", "none"], default="none", help="write both contacts, the source moved")
     add_length_unit(parser)
     parser.add_argument("--no-pictures", action="store_true", help="no picture of both contacts")
@@ -51,10 +51,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Find the poses, write pose.json, and print them."""
     clouds = [path.suffix.lower() in CLOUD_SUFFIXES for path in arguments.files]
+    names = ", ".join(map(str, arguments.files))
     if any(clouds) and (not all(clouds) or len(clouds) != 2):
-        raise UsageError(f"expected two clouds and nothing beside them, got {', '.join(map(str, arguments.files))}")
+        raise UsageError(f"expected two clouds and nothing beside them, got {names}")
     if not any(clouds) and len(clouds) != 3:
-        names = ", ".join(map(str, arguments.files))
         raise UsageError(f"expected a calibration file, an image, folder or video, and an image as reference, got {names}")
     check_folder(arguments.out)
     if all(clouds):
@@ -68,12 +68,9 @@ def run(arguments: argparse.Namespace) -> int:
     if len(results) > 1 and without:
         print(f"no pose in {len(without)} of {len(results)} frames, the first {without[0]['frame']}: {without[0]['message']}")
     print(f"wrote {arguments.out / 'pose.json'}")
-    if all(clouds):
-        step = "T_target_source of pose.json takes points of the source to the target"
-    elif without:
+    step = "T_target_source of pose.json takes points of the source to the target"
+    if without and not all(clouds):
         step = f"torchvts diagnose {arguments.files[0]} {arguments.files[1]} says what is wrong with the frames"
-    else:
-        step = f"torchvts track {arguments.files[0]} FILM --out FOLDER follows the object from its first touch"
     return ended(metric, without, step)
 
 
@@ -91,7 +88,7 @@ def of_clouds(arguments: argparse.Namespace, source_file: Path, target_file: Pat
             )
     found = register_points(source, target, source_normals=source_normals, target_normals=target_normals)
     print_result(source_file.stem, found, source, target)
-    draw(arguments, source_file.stem, source, target, found, frame)
+    draw(arguments, source_file.stem, (source, target), found, frame)
     return [record(source_file.stem, found, frame)]
 
 
@@ -100,7 +97,7 @@ def of_frames(arguments: argparse.Namespace, calibration: Calibration, source: P
     recording, pitch = Recording(calibration, arguments.mode, network=arguments.network), calibration.sensor.mm_per_pixel
     written = OutputFrame(arguments.length_unit, calibration.sensor)
 
-    def depth_of(image: torch.Tensor) -> DepthOutput:
+    def depth_of(image: Tensor) -> DepthOutput:
         image = calibration.sensor.rectify(image[None])
         if reason := recording.unusable(image):
             raise ValueError(f"frame: expected one that can be used: {reason}")
@@ -129,7 +126,7 @@ def of_frames(arguments: argparse.Namespace, calibration: Calibration, source: P
         if len(results) <= 20:
             print_result(name, found, points, target_points)
         if count == 1:
-            draw(arguments, name, points, target_points, found, written)
+            draw(arguments, name, (points, target_points), found, written)
     return results
 
 
@@ -150,7 +147,7 @@ def record(name: str, found: Registration, written: OutputFrame) -> dict[str, An
     }
 
 
-def print_result(name: str, found: Registration, source: torch.Tensor, target: torch.Tensor) -> None:
+def print_result(name: str, found: Registration, source: Tensor, target: Tensor) -> None:
     """Print a pose in words; where it is one of several that fit, also how the contact has moved, of points (N, 3), mm."""
     T = found.T_target_source
     turn = float(torch.rad2deg(torch.atan2(T[1, 0], T[0, 0])))
@@ -167,16 +164,11 @@ def print_result(name: str, found: Registration, source: torch.Tensor, target: t
 
 
 def draw(
-    arguments: argparse.Namespace,
-    name: str,
-    source: torch.Tensor,
-    target: torch.Tensor,
-    found: Registration,
-    written: OutputFrame,
+    arguments: argparse.Namespace, name: str, contacts: tuple[Tensor, Tensor], found: Registration, written: OutputFrame
 ) -> None:
     """Draw both contacts, and write their clouds."""
     make_folder(arguments.out)
-    T = found.T_target_source
+    (source, target), T = contacts, found.T_target_source
     if not arguments.no_pictures:
         viz.save_figure(viz.pose_figure(source, target, T, name), arguments.out / f"{name}_pose.png")
     if arguments.cloud != "none":

@@ -28,7 +28,7 @@ from ..model.report import warnings_of
 from ..model.summary import SHOWN, doubts_of
 from ..stream import Recording, frames, read_background, read_press_images
 from ..viz import NAME_SHOWN, save_figure, sheet_figure
-from .options import add_length_unit, add_out, add_pipeline, add_unit, calibrated, contact_of, ended, split_files, working
+from .options import add_length_unit, add_out, add_pipeline, add_unit, calibrated, ended, split_files
 from .parser import UsageError
 
 PASSED = (
@@ -75,12 +75,12 @@ def run(arguments: argparse.Namespace) -> int:
     passed = {name: getattr(arguments, name) for name in PASSED}
     if arguments.pictures is not False and int(os.environ.get("RANK", "0")) == 0:
         write_sheet(unit, inputs, arguments)
-    report = reconstruct_dataset(calibration, inputs, arguments.out, contact=contact_of(arguments.contact), **passed)
+    report = reconstruct_dataset(calibration, inputs, arguments.out, **passed)
     if report.rank > 0:
         return 0
     print_report(report, arguments.out, unit.metric)
-    if arguments.sensor is None:  # else said where it was calibrated
-        print_unit(unit)
+    if arguments.sensor is None and warnings_of(unit.report):  # else said where it was calibrated
+        print(*doubts_of(unit.report), sep="\n")
     if arguments.pictures is None and report.rows > PICTURES_UP_TO:
         print(f"no pictures of more than {PICTURES_UP_TO} frames: --pictures --overwrite draws all, --every N fewer")
     findings = diagnose_some(unit, inputs, report, arguments.every)
@@ -92,16 +92,11 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def write_sheet(unit: Calibration, inputs: list[Path], arguments: argparse.Namespace) -> None:
-    """Write sheet.png before all else: depth of the first images in one scale, by which one sees whether all is well.
-
-    It is not written where there are not two images with a contact among them, nor again where a run goes on.
-    """
+    """Write sheet.png before all else: depth of the first images in one scale, by which one sees whether all is well."""
     path: Path = arguments.out / "sheet.png"
     if path.exists() and not arguments.overwrite:
         return
-    recording = Recording(
-        unit, arguments.mode, network=arguments.network, device=arguments.device, contact=contact_of(arguments.contact)
-    )
+    recording = Recording(unit, arguments.mode, network=arguments.network, device=arguments.device)
     items = [item for item in list_items(tuple(inputs), arguments.every) if not item.is_film]
     shown: list[tuple[float | str, Array, str]] = []
     for item in items[:SHEET]:
@@ -114,21 +109,16 @@ def write_sheet(unit: Calibration, inputs: list[Path], arguments: argparse.Names
             shown.append((item.path[-NAME_SHOWN:], depth, recording.doubt))
     if len(shown) > 1 and max(depth.max() for _, depth, _ in shown) > 0.0:
         make_folder(path.parent)
-        with working(f"drawing {path.name}"):
-            title = f"the first {len(shown)} of {len(items)} images"
-            save_figure(sheet_figure(shown, unit.sensor.mm_per_pixel, title, unit.metric, warnings_of(unit.report)), path)
+        title = f"the first {len(shown)} of {len(items)} images"
+        save_figure(sheet_figure(shown, unit.sensor.mm_per_pixel, title, unit.metric, warnings_of(unit.report)), path)
         print(f"wrote {path}: {title} in one scale", flush=True)
 
 
 def next_step(calibration: Path, inputs: list[Path], arguments: argparse.Namespace, wrong: list[str]) -> str:
     """What to do after a run in which these frames have findings, were left out, or are in doubt."""
     if wrong:
-        source = inputs[0] if len(inputs) == 1 else "INPUT"
-        return f"torchvts diagnose {calibration} {source} says what is wrong, the docs/diagnose.md page what to do"
-    if arguments.format in ("npz", "video-npz"):
-        points = "; --cloud ply adds the contact as points" if arguments.cloud == "none" else ""
-        return f"vts.read_result(path) reads a file of {arguments.out} in Python{points}"
-    return f"{arguments.out / 'summary.json'} says what the files are"
+        return f"torchvts diagnose {calibration} {inputs[0]} says what is wrong, the docs/diagnose.md page what to do"
+    return f"{arguments.out / 'summary.json'} says what the files are; vts.read_result(path) reads those ending in .npz"
 
 
 def calibrate_first(arguments: argparse.Namespace, inputs: list[Path], unit: Sensor) -> tuple[Path, Calibration]:
@@ -145,12 +135,6 @@ def calibrate_first(arguments: argparse.Namespace, inputs: list[Path], unit: Sen
     make_folder(path.parent)
     calibration.save(path)
     return path, calibration
-
-
-def print_unit(unit: Calibration) -> None:
-    """Print why not to trust a calibration that was given; that depth is not metric is the last line."""
-    if warnings_of(unit.report):
-        print(*doubts_of(unit.report), sep="\n")
 
 
 def print_report(report: RunReport, out: Path, metric: bool) -> None:
@@ -179,10 +163,7 @@ def print_report(report: RunReport, out: Path, metric: bool) -> None:
 
 
 def diagnose_some(unit: Calibration, inputs: list[Path], report: RunReport, every: int) -> list[tuple[str, Finding]]:
-    """What is wrong with :data:`DIAGNOSED` images, and the first frame of each video; frames that were left out are not asked.
-
-    A finding is given once, as the worst frame has it, and how many more have it. Of a frame in doubt only faults are given.
-    """
+    """What is wrong with :data:`DIAGNOSED` images, and the first frame of each video: each finding once, as the worst has it."""
     left_out, doubted = ({name for name, _ in rows} for rows in (report.failed, report.doubted))
     items = list(list_items(tuple(inputs), every))
     if len(items) > DIAGNOSED:

@@ -2,7 +2,6 @@
 
 import argparse
 import signal
-import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -13,15 +12,10 @@ import torch
 from ..calibration import Press
 from ..core.checks import check_integer
 from ..model import Calibration, Sensor
-from ..stream import (
-    CameraSettings,
-    TactileStream,
-    read_background,
-    read_press_images,
-)
+from ..stream import CameraSettings, TactileStream, read_background, read_press_images
 from ..stream.numbered import SourceFrames
 from ..stream.sources import FileReader
-from .options import add_pipeline, add_unit, calibrated, contact_of, split_files
+from .options import add_pipeline, add_unit, calibrated, split_files
 from .parser import UsageError
 
 
@@ -58,8 +52,7 @@ def load_unit(arguments: argparse.Namespace) -> tuple[Sensor | Calibration, str]
     """The sensor or the calibration that was given, and the source; sets the threads that were asked for."""
     unit, sources = split_files(arguments)
     if len(sources) > 1:
-        remedy = "a folder holds several images, and torchvts pose compares two"
-        raise UsageError(f"expected one source, got {', '.join(sources)}: {remedy}")
+        raise UsageError(f"expected one source, got {', '.join(sources)}: a folder holds several images")
     check_integer("--threads", arguments.threads, 1)
     torch.set_num_threads(arguments.threads)
     cv2.setNumThreads(arguments.threads)
@@ -68,7 +61,6 @@ def load_unit(arguments: argparse.Namespace) -> tuple[Sensor | Calibration, str]
 
 def open_stream(arguments: argparse.Namespace, unit: Sensor | Calibration, source: str) -> TactileStream:
     """The stream of the source; says what it found."""
-    started = time.perf_counter()
     presses: Sequence[Press] = ()
     if isinstance(unit, Sensor):
         presses = read_press_images(arguments.press, unit)
@@ -84,7 +76,6 @@ def open_stream(arguments: argparse.Namespace, unit: Sensor | Calibration, sourc
         realtime=arguments.realtime,
         network=arguments.network,
         device=arguments.device,
-        contact=contact_of(arguments.contact),
         record=arguments.record,
         settings=settings_of(arguments),
     )
@@ -92,15 +83,14 @@ def open_stream(arguments: argparse.Namespace, unit: Sensor | Calibration, sourc
     note = f"the first {first} are without contact" if first else "the calibration's background is used as it is"
     assumed = " are assumed, without times.csv" if isinstance(stream.reader, FileReader) and stream.reader.fps_assumed else ""
     print(f"{stream.reader.name}: {stream.fps:g} frames a second{assumed}; {note}")
-    print(f"{stream.calibration}\nready after {time.perf_counter() - started:.1f} s")
+    print(stream.calibration)
     return stream
 
 
 def play(stream: TactileStream | SourceFrames, take: Callable[[Any], bool]) -> OSError | None:
     """Give every frame to ``take`` until the source ends, it returns False, or Ctrl-C (SIGINT, SIGTERM).
 
-    Returns:
-        Why the source has stopped, or the recording could not be written, to raise when the files are done; None where all is well.
+    Returns why the source has stopped, or the recording could not be written, to raise when the files are done.
     """
     lost: OSError | None = None
     asked: list[int] = []

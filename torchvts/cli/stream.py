@@ -59,7 +59,7 @@ def run(arguments: argparse.Namespace) -> int:
         print(report.table())
         if arguments.out is not None:  # before the video is done, which may fail
             report.save(arguments.out)
-            if sheet.times:
+            if sheet.any_contact:
                 save_figure(sheet.figure(), arguments.out / "sheet.png")
     if arguments.out is not None:
         print(f"wrote {len(report.rows)} frames to {arguments.out}")
@@ -68,7 +68,7 @@ def run(arguments: argparse.Namespace) -> int:
     step, wrong = "", stream.left_out or report.doubted
     if wrong:
         step = "torchvts diagnose CALIBRATION RECORDING says what is wrong; --record keeps a camera's frames for it"
-    elif arguments.out is not None and sheet.times:
+    elif arguments.out is not None and sheet.any_contact:
         step = f"look at {arguments.out / 'sheet.png'}; frames.csv has depth and area of each frame"
     return ended(stream.metric, wrong, step)
 
@@ -78,7 +78,7 @@ class _Files:
 
     def __init__(self, stream: TactileStream, report: StreamReport, sheet: Sheet, video: VideoFile | None) -> None:
         self.stream, self.report, self.sheet, self.video = stream, report, sheet, video
-        self.overlay = Overlay(stream.metric, stream.calibration.sensor.mm_per_pixel)
+        self.overlay = Overlay(stream.calibration.sensor.mm_per_pixel, stream.metric)
         self.shown = -1
 
     def add(self, frame: TactileFrame) -> bool:

@@ -72,15 +72,16 @@ def run(arguments: argparse.Namespace) -> int:
     unit, source = load_unit(arguments)
     with contextlib.ExitStack() as stack:
         stream = stack.enter_context(open_stream(arguments, unit, source))
-        tracker = None if reference is None else _tracker_of_image(stream, arguments.reference, reference)
+        pitch = stream.calibration.sensor.mm_per_pixel
+        tracker = None if reference is None else tracker_of_image(stream, arguments.reference, reference)
         make_folder(arguments.out)
         video = None
         if arguments.video != "none":
             video = stack.enter_context(VideoFile(arguments.out / f"track.{arguments.video}", stream.fps))
         view = None
         if arguments.view or arguments.save is not None:
-            view = stack.enter_context(LiveView(_pitch(stream), stream.metric, save=arguments.save, viewer=arguments.view))
-        tracking = _Tracking(stream, video, view, tracker, arguments.least_mm2, arguments.length_unit)
+            view = stack.enter_context(LiveView(pitch, stream.metric, save=arguments.save, viewer=arguments.view))
+        tracking = _Tracking(arguments, stream, video, view, tracker)
         lost = play(stream, tracking.add)
         if tracking.tracker is None:
             raise lost or ValueError("source: expected a contact to track, got none: see --least-mm2")
@@ -111,16 +112,16 @@ class _Tracking:
 
     def __init__(
         self,
+        arguments: argparse.Namespace,
         stream: TactileStream,
         video: VideoFile | None,
         view: LiveView | None,
         tracker: PoseTracker | None,
-        least_mm2: float,
-        length_unit: str,
     ) -> None:
-        self.frame = OutputFrame(length_unit, stream.calibration.sensor)
-        self.video, self.view, self.tracker, self.least_mm2, self.pitch = video, view, tracker, least_mm2, _pitch(stream)
-        self.overlay = Overlay(stream.metric, self.pitch)
+        self.frame = OutputFrame(arguments.length_unit, stream.calibration.sensor)
+        self.video, self.view, self.tracker, self.least_mm2 = video, view, tracker, arguments.least_mm2
+        self.pitch = stream.calibration.sensor.mm_per_pixel
+        self.overlay = Overlay(self.pitch, stream.metric)
         self.reference: int | None = None
         self.rows: list[dict[str, object]] = []
 
@@ -149,10 +150,7 @@ class _Tracking:
 
 
 def record(frame: TactileFrame, found: TrackedPose, written: OutputFrame) -> dict[str, object]:
-    """A row of poses.csv: T_frame_reference, row by row, and what speaks for and against it.
-
-    Standard deviations are those of the shifts T03, T13, T23, in mm, and of small turns about x, y, z.
-    """
+    """A row of poses.csv: T_frame_reference, standard deviations of its shifts and of small turns, what speaks against it."""
     pose = [f"{value:.9g}" for value in written.pose(found.T_target_source)[:3].flatten().tolist()]
     std_of = written.covariance(found.covariance).diagonal().sqrt()
     std = [f"{value:.4g}" for value in (*(written.mm * std_of[3:]).tolist(), *torch.rad2deg(std_of[:3]).tolist())]
@@ -171,10 +169,7 @@ def axes(found: TrackedPose, tracker: PoseTracker) -> Tensor:
 
 
 def draw_axes(image: Tensor, found: TrackedPose, tracker: PoseTracker, mm_per_pixel: float) -> Tensor:
-    """The image (3, H, W) with the reference's x (red), y (green) and z (blue): :func:`axes`.
-
-    They are thin where a rotation is unknown, or known less well than to 1 degree.
-    """
+    """The image (3, H, W) with :func:`axes`, thin where a rotation is unknown, or known less well than to 1 degree."""
     height, width = image.shape[1:]
     moved = axes(found, tracker)
     column, row = moved[:, 0] / mm_per_pixel + 0.5 * (width - 1), 0.5 * (height - 1) - moved[:, 1] / mm_per_pixel
@@ -187,26 +182,22 @@ def draw_axes(image: Tensor, found: TrackedPose, tracker: PoseTracker, mm_per_pi
     return torch.from_numpy(pixels).permute(2, 0, 1).float() / 255.0
 
 
-def _pitch(stream: TactileStream) -> float:
-    return stream.calibration.sensor.mm_per_pixel
-
-
-def _tracker_of_image(stream: TactileStream, path: Path, image: Tensor) -> PoseTracker:
+def tracker_of_image(stream: TactileStream, path: Path, image: Tensor) -> PoseTracker:
+    """A tracker whose reference is an image."""
     image = stream.calibration.sensor.rectify(image[None])
-    reason = stream.recording.unusable(image)
-    if reason:
+    if reason := stream.recording.unusable(image):
         raise ValueError(f"reference: {path}: {reason}")
     with torch.inference_mode():
-        return PoseTracker(stream.recording.pipe(image), _pitch(stream))
+        return PoseTracker(stream.recording.pipe(image), stream.calibration.sensor.mm_per_pixel)
 
 
 def summary(tracking: _Tracking, stream: TactileStream) -> dict[str, Any]:
     """What summary.json holds: counts of frames, what was unknown, keyframes, drift, and whether depth is metric."""
-    rows, graph = tracking.rows, tracking.tracker.graph if tracking.tracker else None
+    tracker, rows = tracking.tracker, tracking.rows
+    assert tracker is not None
     lost = [row for row in rows if row["lost"]]
     followed = [row for row in rows if not row["lost"]]
-    drift = {name: max((float(str(row[name])) for row in followed), default=0.0) for name in ("drift_deg", "drift_mm")}
-    closures = [] if tracking.tracker is None else tracking.tracker.closures
+    drift_deg, drift_mm = (max((float(str(row[f"drift_{u}"])) for row in followed), default=0.0) for u in ("deg", "mm"))
     return {
         **summary_of(stream, len(rows)),
         "poses": tracking.frame.axes,
@@ -215,11 +206,11 @@ def summary(tracking: _Tracking, stream: TactileStream) -> dict[str, Any]:
         "lost_because": dict(Counter(str(row["lost"]) for row in lost).most_common()),
         "converged": sum(row["converged"] == 1 for row in rows),
         "unknown_motions": dict(Counter(str(row["ambiguous"]) for row in rows if row["ambiguous"]).most_common()),
-        "keyframes": len(graph.keyframes) if graph else 0,
-        "loops_closed": [{"deg": deg, "mm": mm} for deg, mm in closures],
+        "keyframes": len(tracker.graph.keyframes),
+        "loops_closed": [{"deg": deg, "mm": mm} for deg, mm in tracker.closures],
         "median_std": _median_std(followed),
-        "largest_drift_deg": drift["drift_deg"],
-        "largest_drift_mm": drift["drift_mm"],
+        "largest_drift_deg": drift_deg,
+        "largest_drift_mm": drift_mm,
     }
 
 
@@ -251,6 +242,3 @@ def _print_summary(found: dict[str, Any]) -> None:
         said = {name: "not seen" if value is None else f"{value:.2g}" for name, value in found["median_std"].items()}
         shifts, turns = (", ".join(f"{axis} {said[key.format(axis)]}" for axis in "xyz") for key in ("{}_mm", "r{}_deg"))
         print(f"  standard deviations, medians: {shifts} mm; turns about {turns} degrees")
-    if found["keyframes"] > 1:
-        deg, mm = found["largest_drift_deg"], found["largest_drift_mm"]
-        print(f"  drift over keyframes: up to {deg:.2g} degrees and {mm:.2g} mm")

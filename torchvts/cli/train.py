@@ -23,11 +23,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("folder", type=Path, metavar="FOLDER", help="presses of balls, in gs_sdk's layout")
     add_sensor(parser)
     parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="network to write, .safetensors")
-    parser.add_argument("--seed", type=int, default=0, metavar="N", help="of weights, order and held-out presses (0)")
-    parser.add_argument(
-        "--max-epochs", type=int, default=60, metavar="N", help="at most (60); stops where held-out error does not fall"
-    )
-    parser.add_argument("--blur-px", type=float, default=1.0, metavar="PX", help="blur of the images, kept in the file (1.0)")
+    text = "at most (60); stops where held-out error does not fall"
+    parser.add_argument("--max-epochs", type=int, default=60, metavar="N", help=text)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -38,12 +35,10 @@ def run(arguments: argparse.Namespace) -> int:
         raise UsageError(f"--out: expected a name ending in .safetensors, got {arguments.out}")
     sensor = load_sensor(arguments.sensor)
     background, presses = cut_frames(*read_presses(arguments.folder), sensor)
-    fit = train_network(
-        background, presses, sensor, arguments.blur_px, arguments.seed, max_epochs=arguments.max_epochs, progress=True
-    )
+    fit = train_network(background, presses, sensor, max_epochs=arguments.max_epochs, progress=True)
     training, held_out = fit.history[fit.best_epoch]
     fit.module.save(arguments.out)
-    print(f"{sum(p.numel() for p in fit.module.parameters())} weights, seed {arguments.seed}")
+    print(f"{sum(p.numel() for p in fit.module.parameters())} weights")
     print(f"RMS error of the slopes' angles: training {training:.2f} deg, held out {held_out:.2f} deg")
     print(fit.message)
     print(f"wrote {arguments.out}: torchvts reconstruct unit.safetensors INPUT --network {arguments.out} --out FOLDER uses it")

@@ -14,6 +14,7 @@ examples:
 import argparse
 from pathlib import Path
 
+from ..core.files import make_folder
 from ..core.results import Facts, write_result
 from ..skin import motion_of_unit
 from ..stream import Keys, LiveView, StreamReport, TactileFrame, TactileStream, has_screen, require_rerun
@@ -33,13 +34,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--web", action="store_true", help="serve the page that measures in the browser, on this machine alone")
     parser.add_argument("--save", type=Path, metavar="FILE.rrd", help="record from the start; no viewer is opened")
     parser.add_argument("--out", type=Path, metavar="FOLDER", default=Path("out/view"), help="of snapshots and recordings")
-    parser.add_argument(
-        "--exaggeration",
-        type=float,
-        default=EXAGGERATION,
-        metavar="X",
-        help=f"of heights on the screen ({EXAGGERATION:g})",
-    )
+    text = f"of heights on the screen ({EXAGGERATION:g})"
+    parser.add_argument("--exaggeration", type=float, default=EXAGGERATION, metavar="X", help=text)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -55,10 +51,8 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.save is None and not has_screen():
         raise UsageError("expected --save FILE.rrd, for this machine has no screen that the viewer could open on")
     with open_stream(arguments, *load_unit(arguments)) as stream:
-        pitch = stream.calibration.sensor.mm_per_pixel
-        view = LiveView(
-            pitch, stream.metric, save=arguments.save, viewer=arguments.save is None, exaggeration=arguments.exaggeration
-        )
+        pitch, viewer = stream.calibration.sensor.mm_per_pixel, arguments.save is None
+        view = LiveView(pitch, stream.metric, save=arguments.save, viewer=viewer, exaggeration=arguments.exaggeration)
         with view, Keys() as keys:
             viewing = _Viewing(stream, view, keys, arguments.out)
             lost = play(stream, viewing.add)
@@ -95,17 +89,14 @@ class _Viewing:
 
     def snapshot(self, frame: TactileFrame) -> None:
         """Write the frame as npz and as a picture."""
-        self.out.mkdir(parents=True, exist_ok=True)
-        path, sensor = self.out / f"frame_{frame.number:06}.npz", self.stream.calibration.sensor
+        path, sensor = make_folder(self.out) / f"frame_{frame.number:06}.npz", self.stream.calibration.sensor
         metric, doubts, doubt = self.stream.metric, self.stream.calibration.report.get("doubts", []), self.stream.doubt
         write_result(path, frame.output, Facts(sensor.mm_per_pixel, "", sensor.name, metric, doubts), str(frame.number), doubt)
         title, said = f"{sensor.name}, {frame.time_s:.2f} s", [f"IN DOUBT: {doubt}"] if doubt else []
         motion = motion_of_unit(self.stream.calibration)
-        moved = None if motion is None else motion(frame.image.reshape(1, *frame.image.shape[-3:]), frame.output.depth_mm)
-        contact = frame.output.contact
-        figure = depth_figure(
-            frame.output.depth_mm, sensor.mm_per_pixel, frame.image, contact, title, metric=metric, doubts=said, moved=moved
-        )
+        output, pitch = frame.output, sensor.mm_per_pixel
+        moved = None if motion is None else motion(frame.image[None], output.depth_mm)
+        figure = depth_figure(output.depth_mm, pitch, frame.image, output.contact, title, metric=metric, doubts=said, moved=moved)
         save_figure(figure, path.with_suffix(".png"))
         print(f"wrote {path} and .png")
 
@@ -116,7 +107,6 @@ class _Viewing:
             self.view.record(None)
             print(f"wrote {running}")
             return
-        self.out.mkdir(parents=True, exist_ok=True)
-        path = self.out / f"from_{frame.number:06}.rrd"
+        path = make_folder(self.out) / f"from_{frame.number:06}.rrd"
         self.view.record(path)
         print(f"recording to {path}")

@@ -23,9 +23,6 @@ HEIGHT, WIDTH, PITCH_MM = 120, 160, 0.12
 PORT = 8470
 """Of the page, where it is free: a browser keeps the permission for a camera, and the page without a network, by it."""
 
-ANY_SPREAD = 1e6
-"""For :data:`torchvts.skin.weight.MOST_SPREAD`: none."""
-
 
 def drawn_unit() -> tuple[DepthPipeline, Tensor]:
     """A drawn rig of three lights, and its image (3, H, W) of a ball pressed in."""
@@ -45,7 +42,7 @@ def prior_unit(sensor: Sensor) -> DepthPipeline:
     light = prior.background(sensor.height, sensor.width, sensor.mm_per_pixel).float().clamp(0.0, 1.0)
     pipe = DepthPipeline.from_calibration(calibrate(light ** (1.0 / prior.response.gamma), sensor), "precise")
     assert isinstance(pipe.mask, ContactMask)
-    pipe.mask.most_spread = ANY_SPREAD  # the light of units of a type differs smoothly, as that of skin that hangs
+    pipe.mask.most_spread = 1e6  # none: the light of units of a type differs smoothly, as that of skin that hangs
     return pipe
 
 
@@ -67,18 +64,10 @@ def write_plans(folder: Path, calibration: Calibration | None = None) -> None:
 
 
 def write_page(folder: Path, calibration: Calibration | None = None) -> None:
-    """Write all files of the page.
-
-    Args:
-        folder: where to.
-        calibration: of a unit, which the page then offers; None for none.
-    Raises:
-        FileNotFoundError: the library for browsers is neither in the package nor built in the checkout.
-    """
+    """Write all files of the page, which offers the unit of a calibration if there is one."""
     here = PACKAGE / "web" if (PACKAGE / "web").is_dir() else PACKAGE.parent / "web"
-    if not (here / "torchvts.wasm").is_file():
-        why = "this torchvts was built without it; make wasm builds it in a checkout"
-        raise FileNotFoundError(f"{here / 'torchvts.wasm'}: no such file: {why}")
+    if not (library := here / "torchvts.wasm").is_file():
+        raise FileNotFoundError(f"{library}: no such file: this torchvts was built without it; make wasm builds it in a checkout")
     make_folder(folder)
     for path in here.iterdir():
         shutil.copyfile(path, folder / path.name)

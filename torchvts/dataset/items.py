@@ -36,7 +36,7 @@ class Item(NamedTuple):
         stem: path of its results inside the output folder, without suffix.
         mark: size in bytes and time of modification in ns; another mark means another file.
         file: the file itself.
-        is_film: whether it has frames with numbers: a video, a TIFF of several pages, or a recording in a container.
+        is_film: whether it has frames with numbers.
     """
 
     path: str
@@ -59,12 +59,7 @@ Source = tuple[Path, ...]
 
 
 def one_line(text: str) -> str:
-    """A text with control characters, line ends and what is not UTF-8 as backslash escapes.
-
-    Example:
-        >>> one_line("a\\nb.png")
-        'a\\\\nb.png'
-    """
+    """A text with control characters, line ends and what is not UTF-8 as backslash escapes."""
     return "".join(
         repr(letter)[1:-1] if letter < " " or letter in "\x7f\x85\u2028\u2029" or "\ud800" <= letter <= "\udfff" else letter
         for letter in text
@@ -89,20 +84,18 @@ def list_items(source: str | Path | Source, every: int = 1) -> Iterator[Item]:
         ...     [(item.path, item.stem) for item in list_items(folder)]
         [('a.jpg', 'a.jpg'), ('a.png', 'a.png'), ('b.png', 'b')]
     """
+    first, *more = source if isinstance(source, tuple) else (Path(source),)
+    if more:
+        items = _several((first, *more))
+    elif is_folder(first):
+        items = _walk(first, "")
+    else:
+        items = iter([_item(first, "", first.stem)])
     images = 0
-    for item in _list(source if isinstance(source, tuple) else (Path(source),)):
+    for item in items:
         images += not item.is_film
         if item.is_film or (images - 1) % every == 0:
             yield item
-
-
-def _list(source: Source) -> Iterator[Item]:
-    if len(source) > 1:
-        yield from _several(source)
-    elif is_folder(source[0]):
-        yield from _walk(source[0], "")
-    else:
-        yield _item(source[0], "", source[0].stem)
 
 
 def _item(file: Path, prefix: str, stem: str) -> Item:
@@ -145,19 +138,12 @@ def _walk(folder: Path, prefix: str) -> Iterator[Item]:
     with os.scandir(folder) as entries:
         kept = sorted((entry for entry in entries if not entry.name.startswith(".")), key=lambda entry: natural_order(entry.name))
     suffixes = IMAGE_SUFFIXES + VIDEO_SUFFIXES
-    stems = output_stems([entry.name for entry in kept if entry.name.lower().endswith(suffixes) and not _is_folder(entry)])
+    stems = output_stems([entry.name for entry in kept if entry.name.lower().endswith(suffixes) and not Path(entry).is_dir()])
     for entry in kept:
         if entry.name in stems:
             yield _item(folder / entry.name, prefix, stems[entry.name])
         elif entry.is_dir(follow_symlinks=False) and not (folder / entry.name / STATE).is_dir():
             yield from _walk(folder / entry.name, f"{prefix}{entry.name}/")
-
-
-def _is_folder(entry: "os.DirEntry[str]") -> bool:
-    try:
-        return entry.is_dir()
-    except OSError:  # a link to itself
-        return False
 
 
 def output_stems(names: list[str]) -> dict[str, str]:

@@ -4,6 +4,7 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
+from itertools import chain
 from typing import NamedTuple
 
 import torch
@@ -22,41 +23,35 @@ AHEAD = 8
 
 
 class Entry(NamedTuple):
-    """A frame, without image where it cannot be used or is not needed any more, or the end of a film.
+    """A frame; or the end of a film.
 
     Attributes:
         item: the file that it is from.
         number: of a video's frame; -1 for an image.
-        done: whether its result is there.
+        image: (1, 3, H, W), rectified; None where its result is there already, or it failed.
         failed: why it cannot be used; empty where it can.
         length: the number of frames of a video, in an entry of its own at the end; None in all others.
-        doubt: why less may have been seen in it than is there; empty for nothing.
         recording: of a video's frame, by its first frames; None for an image.
     """
 
     item: Item
     number: int = -1
-    done: bool = False
+    image: Tensor | None = None
     failed: str = ""
     length: int | None = None
-    doubt: str = ""
     recording: Recording | None = None
 
-
-Loaded = tuple[Entry, Tensor | None]
-"""A frame, and its image (1, 3, H, W), rectified, if it has one."""
+    @property
+    def done(self) -> bool:
+        """Whether its result is there already."""
+        return self.image is None and not self.failed and self.length is None
 
 
 class Loader:
     """Every N-th image and the frames of every video: those of one rank's share.
 
-    Decoding a video in order is exact for any codec; seeking is not.
-
-    Args:
-        records: of the run: which source it reads and which frames are done.
-        sensor: rectifies the frames.
-        share: rank of this process, number of processes.
-        begin: makes the recording of a video by its first frames that can be read, rectified.
+    Decoding a video in order is exact for any codec; seeking is not. ``begin`` makes the recording of a video by its first frames
+    that can be read, rectified.
     """
 
     def __init__(
@@ -64,7 +59,7 @@ class Loader:
     ) -> None:
         self.records, self.sensor, self.share, self.begin = records, sensor, share, begin
 
-    def frames(self, workers: int) -> Iterator[Loaded]:
+    def frames(self, workers: int) -> Iterator[Entry]:
         """All frames in order, read by so many threads beside the one that goes through the videos."""
         pool = partial(ThreadPoolExecutor, initializer=torch.set_num_threads, initargs=(self.records.settings.threads,))
         with pool(workers) as readers, pool(1) as order:
@@ -74,16 +69,16 @@ class Loader:
                 ahead.append(order.submit(next, share, None))
                 yield found.result() if isinstance(found, Future) else found
 
-    def _load(self, entry: Entry, read: Callable[[], Pixels]) -> Loaded:
+    def _load(self, entry: Entry, read: Callable[[], Pixels]) -> Entry:
         """A frame rectified, or why there is none."""
         import cv2
 
         try:
-            return entry, self.sensor.rectify(rgb_from_bgr(read())[None]).clamp(0.0, 1.0)
+            return entry._replace(image=self.sensor.rectify(rgb_from_bgr(read())[None]).clamp(0.0, 1.0))
         except (OSError, ValueError, cv2.error) as error:
-            return entry._replace(failed=in_one_line(error)), None
+            return entry._replace(failed=in_one_line(error))
 
-    def _share(self, readers: ThreadPoolExecutor) -> "Iterator[Loaded | Future[Loaded]]":
+    def _share(self, readers: ThreadPoolExecutor) -> "Iterator[Entry | Future[Entry]]":
         rank, world = self.share
         count = 0
         for item in list_items(self.records.source, self.records.settings.every):
@@ -94,36 +89,34 @@ class Loader:
             if (count - 1) % world != rank:
                 continue
             if self.records.is_done(item, -1):
-                yield Entry(item, done=True), None
+                yield Entry(item)
             else:
                 yield readers.submit(self._load, Entry(item), partial(read_pixels, item.file))
 
-    def _video(self, item: Item) -> Iterator[Loaded]:
+    def _video(self, item: Item) -> Iterator[Entry]:
         rank, world = self.share
         records, every = self.records, self.records.settings.every
         length = records.length(item)
         own = range(rank * every, length or 0, world * every)
         if length is not None and all(records.is_done(item, number) for number in own):
-            yield from ((Entry(item, number, done=True), None) for number in own)
+            yield from (Entry(item, number) for number in own)
             return
         try:
-            frames, first = enumerate(raw_frames(item.file)), list[Loaded]()
+            frames, first = enumerate(raw_frames(item.file)), list[Entry]()
             images: list[Tensor] = []
             while len(images) < records.settings.background_frames and (found := next(frames, None)) is not None:
-                entry, image = self._load(Entry(item, found[0]), found[1].read)
-                first.append((entry, image))
-                images += [] if image is None else [image]
+                first.append(self._load(Entry(item, found[0]), found[1].read))
+                images += [] if first[-1].image is None else [first[-1].image]
             recording, count = self.begin(item, images), len(first)
-            for entry, image in first:
+            rest = ((Entry(item, number), frame.read) for number, frame in frames)
+            for entry, read in chain(((entry, None) for entry in first), rest):
+                count = max(count, entry.number + 1)
                 if entry.number % every == 0 and entry.number // every % world == rank:
-                    done = records.is_done(item, entry.number)
-                    yield entry._replace(done=done, recording=recording), None if done else image
-            for number, frame in frames:
-                count += 1
-                if number % every == 0 and number // every % world == rank:
-                    entry = Entry(item, number, records.is_done(item, number), recording=recording)
-                    yield (entry, None) if entry.done else self._load(entry, frame.read)
+                    if records.is_done(item, entry.number):
+                        yield Entry(item, entry.number)
+                    else:
+                        yield (self._load(entry, read) if read else entry)._replace(recording=recording)
         except ValueError as error:  # its name, or no frame
-            yield Entry(item, failed=in_one_line(error)), None
+            yield Entry(item, failed=in_one_line(error))
         else:
-            yield Entry(item, length=count), None
+            yield Entry(item, length=count)

@@ -32,11 +32,7 @@ def share() -> Iterator[tuple[int, int]]:
 
 
 def sum_over_processes(count: int) -> int:
-    """Wait for all processes and add up their counts.
-
-    Raises:
-        RuntimeError: a process has stopped.
-    """
+    """Wait for all processes and add up their counts."""
     if not dist.is_initialized():
         return count
     total = torch.tensor(count)

@@ -1,10 +1,8 @@
 """Data sets larger than memory: a folder, an image or a video into depth files and one table, over processes, resumable.
 
 Every process lists the source in the same order, takes each N-th image and each N-th frame of every video, and passes over what is
-done already (:mod:`.records`). At the end rank 0 writes ``frames.csv``. Only the names of one folder are in memory at a time.
-
-A frame's result does not depend on reading threads or processes: each goes through the pipeline by itself, on the same number of
-threads everywhere. (More threads split sums otherwise: depth then differs by up to 3e-7 mm.)
+done already (:mod:`.records`). At the end rank 0 writes ``frames.csv``. A frame's result does not depend on reading threads or
+processes: each goes through the pipeline by itself, on the same number of threads everywhere.
 """
 
 import hashlib
@@ -58,14 +56,11 @@ def reconstruct_dataset(
     """Reconstruct every image and video frame of a source, and continue where an earlier run was stopped.
 
     Under ``torchrun`` (or any launcher that sets RANK, WORLD_SIZE, MASTER_ADDR, MASTER_PORT) the processes share the work; ``out``
-    must then be one folder that all of them see. Files keep their folders: ``sub/a.png`` becomes ``out/sub/a.npz``; where two
-    files of a folder share a stem, the suffix stays in the name: ``a.png.npz``. ``frames.csv`` is the table of all frames,
-    ``summary.json`` says what the files are.
+    must then be one folder that all of them see. docs/datasets.md says which files there are.
 
     Args:
         calibration: file of a calibrated unit.
-        source: image, video, recording in a container, or folder with all below it, or several of these; hidden files, links to
-            folders and results of runs are passed over. Containers are named, not looked for in folders.
+        source: image, video, recording in a container, or folder with all below it, or several of these.
         out: folder for results, made if missing.
         mode: "fast" or "precise".
         format: "npz" (depth, normals, gradient, masks, units; :func:`torchvts.read_result`), "video-npz" (the same, one file a
@@ -78,8 +73,7 @@ def reconstruct_dataset(
         network: gs_sdk's ``nnmodel.pth`` or what ``torchvts train`` wrote, in place of the calibration's model.
         device: of the pipeline, "cpu" or "cuda".
         contact: thresholds of contact; None for the usual ones.
-        background_frames: first frames of a video, which show the skin without contact; 0 uses the calibration as it is, and so
-            does a video where they show contact or that is shorter, with a note.
+        background_frames: first frames of a video, which show the skin without contact; 0 uses the calibration as it is.
         workers: threads of each rank that read images; None chooses.
         threads: of each rank. Results are bit for bit the same only for the same number, so it is one of the settings kept.
         overwrite: begin anew, whatever ``out`` holds.
@@ -91,19 +85,13 @@ def reconstruct_dataset(
         RuntimeError: another process failed, or another run writes there.
     """
     source, out = _source(source), Path(out)
-    for name, value, allowed in (
-        ("mode", mode, MODES),
-        ("format", format, tuple(FORMATS)),
-        ("cloud", cloud, CLOUD_FORMATS),
-        ("length_unit", length_unit, tuple(MM_OF)),
-    ):
-        check_choice(name, value, allowed)
-    for name, number, least in (
-        ("threads", threads, 1),
-        ("every", every, 1),
-        ("background_frames", background_frames, 0),
-    ):
-        check_integer(name, number, least)
+    check_choice("mode", mode, MODES)
+    check_choice("format", format, tuple(FORMATS))
+    check_choice("cloud", cloud, CLOUD_FORMATS)
+    check_choice("length_unit", length_unit, tuple(MM_OF))
+    check_integer("threads", threads, 1)
+    check_integer("every", every, 1)
+    check_integer("background_frames", background_frames, 0)
     if workers is not None:
         check_integer("workers", workers, 1)
     unit = Calibration.load(calibration)

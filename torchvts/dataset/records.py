@@ -52,12 +52,12 @@ class Records:
     def is_done(self, item: Item, frame: int) -> bool:
         """Whether the result of a frame is there, whole."""
         record = self.read(item, frame)
-        if record is None or "failed" in record or "bytes" not in record:
+        if record is None or "bytes" not in record:
             return False
-        files = list(self._files(item, frame, record))
-        if frame >= 0 and (joined := self.joined_file(item)) is not None and joined.is_file():
-            return bool([_size(file) for file in files[1:]] == record["bytes"][1:])
-        return bool([_size(file) for file in files] == record["bytes"])
+        sizes = [os.path.getsize(file) if os.path.isfile(file) else -1 for file in self._files(item, frame, record)]
+        joined = self.joined_file(item) if frame >= 0 else None
+        first = 1 if joined is not None and joined.is_file() else 0
+        return bool(sizes[first:] == record["bytes"][first:])
 
     def length(self, video: Item) -> int | None:
         """Number of frames of a video; None where no process has decoded it to its end."""
@@ -108,19 +108,11 @@ class Records:
             for part in there:
                 part.unlink()
 
-    def _rows(self, item: Item) -> Iterator[tuple[str, Record | None]]:
-        frames: Iterable[int] = (-1,)
-        if item.is_film and (length := self.length(item)) is not None:
-            frames = range(0, length, self.settings.every)
-        return ((item.frame_name(frame), self.read(item, frame)) for frame in frames)
-
     def write_tables(self) -> tuple[int, list[tuple[str, str]], list[tuple[str, str]]]:
         """Write frames.csv, and failed.csv where frames were left out.
 
         Returns:
             Number of rows of frames.csv; (name, reason) of the frames that were left out; (name, doubt) of those in doubt.
-        Raises:
-            RuntimeError: frames without a record, which a process that died was to do.
         """
         count = 0
         failed: list[tuple[str, str]] = []
@@ -130,7 +122,9 @@ class Records:
         def rows() -> Iterator[tuple[str, ...]]:
             nonlocal count
             for item in list_items(self.source, self.settings.every):
-                for name, record in self._rows(item):
+                length = self.length(item) if item.is_film else None
+                for frame in (-1,) if length is None else range(0, length, self.settings.every):
+                    name, record = item.frame_name(frame), self.read(item, frame)
                     if record is None:
                         missing.append(name)
                     elif "failed" in record:
@@ -151,20 +145,8 @@ class Records:
         return count, failed, doubted
 
 
-def _size(path: str) -> int:
-    """Bytes of a file, -1 where there is none."""
-    return os.path.getsize(path) if os.path.isfile(path) else -1
-
-
 def as_cell(text: str) -> str:
-    """A text as a cell of a CSV table: one line, and none that a spreadsheet takes for a formula.
-
-    Before =, +, - and @ stands an apostrophe, which spreadsheets hide.
-
-    Example:
-        >>> as_cell("=1+2.png"), as_cell("a.png")
-        ("'=1+2.png", 'a.png')
-    """
+    """A text as a cell of a CSV table, on one line; an apostrophe keeps a spreadsheet from taking it for a formula."""
     line = one_line(text)
     return f"'{line}" if line.startswith(("=", "+", "-", "@")) else line
 

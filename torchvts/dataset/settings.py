@@ -15,14 +15,7 @@ from ..core.files import make_folder, write_atomically
 from ..stream import FIRST_FRAMES
 from .items import FORMATS, PARTS, STATE, VIDEO_FORMATS, Source, has_few_frames
 
-SUFFIXES = (
-    *filter(None, dict.fromkeys((*FORMATS.values(), *VIDEO_FORMATS.values()))),
-    ".ply",
-    ".obj",
-    ".pcd",
-    ".x3p",
-    "_picture.png",
-)
+SUFFIXES = (*filter(None, {*FORMATS.values(), *VIDEO_FORMATS.values()}), ".ply", ".obj", ".pcd", ".x3p", "_picture.png")
 """How the names of all files of a frame end."""
 
 
@@ -50,14 +43,15 @@ class Settings:
 def begin(source: Source, out: Path, settings: Settings, overwrite: bool) -> Settings:
     """Begin or continue a run in ``out``: write the settings, or compare them with those that are there; remove incomplete files.
 
-    With ``overwrite`` the files of the frames that an earlier run wrote go too, whatever its settings were.
-
-    Raises:
-        ValueError: the run was begun with other settings.
+    With ``overwrite`` the files of the frames that an earlier run recorded go too, whatever its settings were.
     """
     if overwrite:
-        _remove_results(out)
-        shutil.rmtree(out / STATE / "frames", ignore_errors=True)
+        frames = out / STATE / "frames"
+        for record in frames.rglob("*.json"):
+            stem = out / record.relative_to(frames).with_suffix("")
+            for suffix in SUFFIXES:
+                stem.with_name(stem.name + suffix).unlink(missing_ok=True)
+        shutil.rmtree(frames, ignore_errors=True)
         shutil.rmtree(out / STATE / PARTS, ignore_errors=True)
         for path in (out / STATE / "settings.json", out / "frames.csv", out / "failed.csv", out / "summary.json"):
             path.unlink(missing_ok=True)
@@ -76,21 +70,8 @@ def begin(source: Source, out: Path, settings: Settings, overwrite: bool) -> Set
     return settings
 
 
-def _remove_results(out: Path) -> None:
-    """Remove the files of every frame that an earlier run recorded, whatever its formats were."""
-    frames = out / STATE / "frames"
-    for record in frames.rglob("*.json"):
-        stem = out / record.relative_to(frames).with_suffix("")
-        for suffix in SUFFIXES:
-            stem.with_name(stem.name + suffix).unlink(missing_ok=True)
-
-
 def join(out: Path, settings: Settings) -> Settings:
-    """The settings with which a run was begun.
-
-    Raises:
-        ValueError: they differ from ``settings``, or cannot be read.
-    """
+    """The settings with which a run was begun; ValueError where they differ from ``settings``, or cannot be read."""
     path = out / STATE / "settings.json"
     try:
         begun = Settings(**json.loads(path.read_text(encoding="utf-8")))
@@ -122,11 +103,7 @@ def join(out: Path, settings: Settings) -> Settings:
 
 @contextmanager
 def locked(out: Path) -> Iterator[None]:
-    """Hold ``out`` for one run; the system releases it when the process ends, however that happens.
-
-    Raises:
-        RuntimeError: another run holds it.
-    """
+    """Hold ``out`` for one run; the system releases it when the process ends, however that happens."""
     make_folder(out / STATE)
     try:
         import fcntl

@@ -6,9 +6,8 @@ the depth of its own. An image is a recording of one frame.
 
 import os
 import sys
-import time
 from collections import deque
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
@@ -22,10 +21,10 @@ from ..core.checks import NAMED, in_one_line
 from ..core.recordings import count_frames, cut_short
 from ..model import Calibration
 from ..pipeline import DepthOutput
-from ..skin import ContactSettings, motion_of_unit
+from ..skin import ContactSettings
 from ..stream import Recording
 from .items import Item, list_items
-from .loading import Entry, Loaded, Loader
+from .loading import Entry, Loader
 from .processes import sum_over_processes
 from .records import Records
 from .writing import Writer
@@ -39,7 +38,6 @@ class RunReport(NamedTuple):
         rows: frames in the table.
         before: how many of them an earlier run had done.
         failed: (name, reason) of the frames that were left out.
-        seconds: from the first frame until all processes had finished.
         notes: (name, text) of what else is to be known: videos whose first frames were not used, or that are cut short.
         doubted: (name, doubt) of the frames in which less may have been seen than is there.
     """
@@ -48,13 +46,8 @@ class RunReport(NamedTuple):
     rows: int
     before: int
     failed: list[tuple[str, str]]
-    seconds: float
     notes: Sequence[tuple[str, str]] = ()
     doubted: Sequence[tuple[str, str]] = ()
-
-
-_Reconstructed = tuple[Entry, Tensor | None, DepthOutput | None]
-"""A frame, its image, and its depth."""
 
 
 class Worker:
@@ -65,7 +58,6 @@ class Worker:
     ) -> None:
         self.unit, self.records, self.settings, self.share, self.strict = unit, records, records.settings, share, strict
         self.sensor, self.writer = unit.sensor, Writer(records, unit, name)
-        self.writer.motion = motion_of_unit(unit) if records.settings.pictures else None
         thresholds = None if self.settings.contact is None else ContactSettings(**self.settings.contact)
         self.recording = partial(
             Recording, unit, self.settings.mode, network=network, device=self.settings.device, contact=thresholds
@@ -85,32 +77,26 @@ class Worker:
             workers = max(1, min(4, cores // 2))
         writers = 1 if self.settings.pictures else 4  # matplotlib draws in one thread only
         waiting: deque[tuple[Entry, Future[str]]] = deque()
-        start = time.perf_counter()
+        loader = Loader(self.records, self.sensor, self.share, self._begin)
         with tqdm(total=total, unit="frame", disable=rank > 0 or None, smoothing=0.05) as bar, ThreadPoolExecutor(writers) as pool:
-            for frame, image, output in self._depths(Loader(self.records, self.sensor, self.share, self._begin).frames(workers)):
+            for frame in loader.frames(workers):
+                if frame.length is not None and (text := cut_short(frame.item.file, frame.length)):
+                    self.notes.append((frame.item.path, text))
                 if frame.done:
                     bar.update()
                 else:
-                    waiting.append((frame, pool.submit(self._write, frame, image, output)))
+                    waiting.append((frame, pool.submit(self._write, *self._depth(frame))))
                 while len(waiting) > 4 * writers:
                     bar.update(self._settle(*waiting.popleft()))
             while waiting:  # pictures take longer than depth
                 bar.update(self._settle(*waiting.popleft()))
         done = sum_over_processes(self.done)
-        seconds = time.perf_counter() - start
         if rank > 0:
-            return RunReport(rank, 0, 0, [], seconds)
+            return RunReport(rank, 0, 0, [])
         self.records.join_videos()
         rows, failed, doubted = self.records.write_tables()
         self.writer.write_summary(rows, len(failed), len(doubted))
-        return RunReport(0, rows, rows - done, failed, seconds, self.notes, doubted)
-
-    def _depths(self, loaded: Iterable[Loaded]) -> Iterator[_Reconstructed]:
-        """The frames of this rank with image and depth."""
-        for frame, image in loaded:
-            if frame.length is not None and (text := cut_short(frame.item.file, frame.length)):
-                self.notes.append((frame.item.path, text))
-            yield (frame, None, None) if image is None else self._depth(frame, image)
+        return RunReport(0, rows, rows - done, failed, self.notes, doubted)
 
     def _begin(self, item: Item, first: list[Tensor]) -> Recording:
         """The recording of a video by its first frames that can be read, rectified."""
@@ -125,19 +111,19 @@ class Worker:
             self.notes.append((item.path, f"first frames not used, the calibration is used as it is: {reason}"))
         return self.recording()
 
-    def _depth(self, frame: Entry, image: Tensor) -> _Reconstructed:
-        """Depth of one frame, or why there is none."""
+    def _depth(self, frame: Entry) -> tuple[Entry, DepthOutput | None, str]:
+        """A frame, its depth, and why less may have been seen in it than is there; or a frame that says why there is none."""
+        if frame.image is None:
+            return frame, None, ""
         recording = frame.recording or self.image
         try:
-            reason = recording.unusable(image)
-            if reason:
-                return frame._replace(failed=reason), None, None
-            output = recording(image)
-            return frame._replace(doubt=recording.doubt), image, output
+            if reason := recording.unusable(frame.image):
+                raise ValueError(reason)
+            return frame, recording(frame.image), recording.doubt
         except ValueError as error:
-            return frame._replace(failed=in_one_line(error)), None, None
+            return frame._replace(failed=in_one_line(error)), None, ""
 
-    def _settle(self, frame: Entry, written: "Future[str]") -> bool:
+    def _settle(self, frame: Entry, written: Future[str]) -> bool:
         """Count a frame whose files are in place, or report why there are none; whether it is a frame, not the end of a video."""
         failed = written.result()  # a full disk is an OSError and stops the run
         if failed:
@@ -152,16 +138,16 @@ class Worker:
             self.done += frame.length is None
         return frame.length is None
 
-    def _write(self, frame: Entry, image: Tensor | None, result: DepthOutput | None) -> str:
+    def _write(self, frame: Entry, result: DepthOutput | None, doubt: str) -> str:
         """Write a frame's files, then its record; returns why there are none, or an empty text."""
         figures: dict[str, Any] = {"failed": frame.failed}
         if frame.length is not None:
             figures = {"frames": frame.length}
-        elif image is not None and result is not None:
+        elif result is not None:
             area = float(result.contact.double().sum()) * self.sensor.mm_per_pixel**2
-            figures = {"deepest_mm": float(result.depth_mm.max()), "contact_mm2": area, "doubt": frame.doubt}
+            figures = {"deepest_mm": float(result.depth_mm.max()), "contact_mm2": area, "doubt": doubt}
             try:
-                self.writer.write(frame, image, result)
+                self.writer.write(frame, result, doubt)
             except ValueError as error:  # a depth that its format does not hold
                 figures = {"failed": in_one_line(error)}
         self.records.write(frame.item, frame.number, **figures)

@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from ..core import __version__
 from ..core.files import DEPTH_PNG_STEP_MM, DEPTH_PNG_ZERO, write_atomically, write_depth_png
@@ -16,7 +15,7 @@ from ..model.report import warnings_of
 from ..pipeline import DepthOutput
 from ..pose import OutputFrame, write_point_cloud
 from ..pose.surface_files import X3P_AXES, write_obj, write_x3p
-from ..skin import SkinMotion
+from ..skin import motion_of_unit
 from .loading import Entry
 from .records import Records
 
@@ -29,10 +28,10 @@ class Writer:
         self.facts = Facts(unit.sensor.mm_per_pixel, name, unit.sensor.name, unit.metric, unit.report.get("doubts", []))
         self.warnings = warnings_of(unit.report)
         self.frame = OutputFrame(records.settings.length_unit, unit.sensor)
-        self.motion: SkinMotion | None = None  # of printed dots, drawn in pictures
+        self.motion = motion_of_unit(unit) if records.settings.pictures else None  # of printed dots
         self.exaggeration: float | None = None  # of heights in all pictures, known from the first contact on
 
-    def write(self, frame: Entry, image: Tensor, result: DepthOutput) -> None:
+    def write(self, frame: Entry, result: DepthOutput, doubt: str) -> None:
         """All files of a frame: its depth, its contact, its picture."""
         pitch, name = self.sensor.mm_per_pixel, frame.item.frame_name(frame.number)
         stem, path = self.records.out / frame.item.frame_stem(frame.number), self.records.result_file(frame.item, frame.number)
@@ -42,23 +41,24 @@ class Writer:
         if joined is not None:
             joined.unlink(missing_ok=True)  # by an earlier run, of other frames
         if path.suffix == ".npz":
-            write_result(path, result, self.facts, name, frame.doubt, compressed=joined is None)
+            write_result(path, result, self.facts, name, doubt, compressed=joined is None)
         elif path.suffix == ".png":
             write_depth_png(path, result.depth_mm)
         elif path.suffix == ".npy":
             with write_atomically(path) as temporary:
                 np.save(temporary, result.depth_mm[0, 0].numpy())
         if self.settings.cloud != "none" and bool(result.contact.any()):
-            self._write_contact(Path(f"{stem}.{self.settings.cloud}"), result, frame.doubt)
+            self._write_contact(Path(f"{stem}.{self.settings.cloud}"), result, doubt)
         if self.settings.pictures:
             from .. import viz
 
             if self.exaggeration is None and bool(result.contact.any()):
                 self.exaggeration = viz.exaggeration_of(float(result.depth_mm.max()), pitch * result.depth_mm.shape[3])
-            doubts = [*self.warnings, *([f"IN DOUBT: {frame.doubt}"] if frame.doubt else [])]
-            moved = None if self.motion is None else self.motion(image.reshape(1, *image.shape[-3:]), result.depth_mm)
+            doubts = [*self.warnings, *([f"IN DOUBT: {doubt}"] if doubt else [])]
+            assert frame.image is not None
+            moved = None if self.motion is None else self.motion(frame.image, result.depth_mm)
             figure = viz.depth_figure(
-                result.depth_mm, pitch, image, result.contact, name, self.exaggeration, self.facts.metric, doubts, moved
+                result.depth_mm, pitch, frame.image, result.contact, name, self.exaggeration, self.facts.metric, doubts, moved
             )
             viz.save_figure(figure, f"{stem}_picture.png")
 

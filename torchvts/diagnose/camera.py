@@ -20,14 +20,7 @@ MOVES = 0.02
 
 
 def levels_of(image: Tensor) -> float:
-    """Number of grey levels of the full range: 255 for 8 bits, inf for floats.
-
-    It follows from the widest spacing that at least 99 % of the values keep to.
-
-    Example:
-        >>> levels_of(torch.round(torch.rand(3, 32, 32) * 63) / 63)
-        63.0
-    """
+    """Number of grey levels, 255 for 8 bits, inf for floats: by the widest spacing that at least 99 % of the values keep to."""
     values = image.detach().double().flatten()
     values = values[(values > 0.0) & (values < 1.0)]  # without clipped ones
     if len(values) < 100:
@@ -43,13 +36,8 @@ def levels_of(image: Tensor) -> float:
 def blockiness(image: Tensor) -> tuple[float, float]:
     """Ratio of second differences across the borders of 8 x 8 blocks to those elsewhere, and by how much they are larger.
 
-    The ratio is 1 for an uncompressed image.
-
-    Measured along rows and columns and at every phase of the grid, so that it works for cropped images too. Smooth structure
-    cancels in second differences, and a median leaves out the rims of objects.
-
-    Args:
-        image: (3, H, W).
+    The ratio is 1 for an uncompressed image (3, H, W). It is measured at every phase of the grid, so of cropped images too. Smooth
+    structure cancels in second differences, and a median leaves out the rims of objects.
     """
     red, green, blue = image.double()
     luma = 0.299 * red + 0.587 * green + 0.114 * blue
@@ -76,13 +64,7 @@ def new_spots(image: Tensor, expected: Tensor, noise_std: Tensor, widest_px: int
 
     A slope takes light from one LED and gives it to another; a spot takes it from all. What counts lies beyond the spread of the
     frame's own skin, and beyond the darkest and brightest that the background has within :data:`MOVES`: skin moves with its spots.
-
-    Args:
-        image: (3, H, W), values.
-        expected: (3, H, W), values predicted from the background.
-        noise_std: (3,), of their difference.
-        widest_px: diameter of the widest spot.
-        free: (H, W) bool, skin without contact, with spots on it.
+    Images are (3, H, W), ``noise_std`` (3,) is of their difference, ``free`` (H, W) the skin without contact, with spots on it.
     """
     import cv2
 
@@ -118,16 +100,9 @@ def new_spots(image: Tensor, expected: Tensor, noise_std: Tensor, widest_px: int
 
 
 def texture_share(image: Tensor, background: Tensor, noise_std: Tensor, background_noise: Tensor, free: Tensor) -> float | None:
-    """Power of an image's fine texture over the background's; None where the background has none beyond its noise.
+    """Power of an image's fine texture over the background's, of free skin; None where the background has none beyond its noise.
 
-    Power, not likeness: skin that is stretched keeps its texture, elsewhere.
-
-    Args:
-        image: (3, H, W), values.
-        background: (3, H, W), values.
-        noise_std: (3,), of the image.
-        background_noise: (3,).
-        free: (H, W) bool, skin without contact.
+    Power, not likeness: skin that is stretched keeps its texture, elsewhere. Images are (3, H, W), their noises (3,).
     """
     if int(free.sum()) < 100:
         return None
@@ -139,15 +114,9 @@ def texture_share(image: Tensor, background: Tensor, noise_std: Tensor, backgrou
 
 
 def pattern_likeness(image: Tensor, background: Tensor, noise_std: Tensor, free: Tensor) -> float | None:
-    """Correlation of an image's fine pattern with the background's; None where the background has none beyond its noise.
+    """Correlation of an image's fine pattern with the background's, of free skin; None where that has none beyond its noise (3,).
 
     On one unit it is 0.06 at least, where noise hides the pattern, and usually 0.1 to 0.5; on others of the same type at most 0.04.
-
-    Args:
-        image: (3, H, W), values.
-        background: (3, H, W), values.
-        noise_std: (3,), of the background.
-        free: (H, W) bool, skin without contact.
     """
     noise = float((noise_std.double() ** 2).sum())
     if int(free.sum()) < 100 or _fine_power(background, free) < 1.1 * noise:

@@ -10,12 +10,13 @@ import torch
 from ..calibration import ROUGH, channel_structure
 from ..compensate.light import unevenness
 from ..core.frame import Conditions
+from ..core.geometry import lengths
 from ..core.levels import SATURATED
 from ..model.markers import FEWEST_DOTS
 from ..model.stated_error import stated_deg, stated_error_deg
 from ..model.summary import SATURATED_SHARE
 from ..model.usable import FrameCheck
-from ..pipeline import UNEVEN, UNSEEN_DEG, DepthPipeline
+from ..pipeline import UNEVEN, UNSEEN_DEG, DepthPipeline, usual_unseen_deg
 from .camera import blockiness, levels_of, new_spots, pattern_likeness, texture_share
 from .examination import MISFITS, Examination
 from .findings import FAULT_DEG, WARNING_DEG, Finding, by_cost
@@ -132,9 +133,9 @@ def _contact(mask: torch.Tensor) -> float | None:
 
 
 def _contact_in_background(e: Examination) -> float | None:
-    light = _light_of_background(e)
+    light = _light_of_background(e)  # what light in another place makes looks like a contact
     if e.given is None or light is None or light["uneven"] > UNEVEN or e.failed_in(e.given) or e.check.flaw(e.given[None]):
-        return None  # what light in another place makes looks like a contact
+        return None
     with torch.no_grad():
         return _contact(e.pipeline(e.given[None].to(e.unit.background.dtype)).contact)
 
@@ -237,7 +238,7 @@ def _by_unevenness(figures: Figures) -> str:
 def _unseen(e: Examination) -> Figures:
     """Slope that the least changed skin hides, and how many times that at calibration it is."""
     unseen = float(e.conditions.unseen_deg)
-    return {"value": unseen, "times": unseen / e.usual_unseen_deg}
+    return {"value": unseen, "times": unseen / usual_unseen_deg(e.unit, e.pipeline)}
 
 
 def _rough(e: Examination) -> Figures:
@@ -268,11 +269,6 @@ def _spots(e: Examination) -> Figures | None:
         return None
     text = f", {dead} dead pixels among them" if dead else ""
     return {"value": float(number), "share": pixels / e.moved.numel(), "dead": text}
-
-
-def _wear(e: Examination) -> float | None:
-    """RMS of an uneven change of brightness of free skin that the channels share, where they share most of it."""
-    return e.grey_change if e.unit.measured else None
 
 
 def _texture_lost(e: Examination) -> float | None:
@@ -326,13 +322,8 @@ def _at_border(e: Examination) -> float | None:
     return float(edge.double().mean()) if bool(edge.any()) else None
 
 
-def _faint(e: Examination) -> float | None:
-    deepest = float(e.output.depth_mm.max())
-    return deepest if deepest < e.unit.sensor.mm_per_pixel else None
-
-
 def _steepest(e: Examination) -> float:
-    inside = e.steepness[e.moved]
+    inside = lengths(e.output.gradient[0], 0)[e.moved]  # mm per mm
     return math.degrees(math.atan(float(inside.float().quantile(0.98)))) if len(inside) else 0.0
 
 
@@ -358,15 +349,6 @@ def _cast_shadow(e: Examination) -> float:
     off = (e.frame.image[0] / flat.clamp_min(1e-6) - 1.0).abs()
     undeformed = off < (6.0 * e.unit.compensated_noise_std / flat.clamp_min(1e-6)).clamp_min(0.03)
     return float((e.dark & undeformed.roll(1, 0) & undeformed.roll(2, 0)).any(0).double().mean())
-
-
-def _deep_press(e: Examination) -> Figures | None:
-    if e.unit.lights is None:
-        return None
-    with torch.no_grad():
-        fast = DepthPipeline.from_calibration(e.unit, "fast").eval()(e.raw[None].to(e.unit.background.dtype)).depth_mm
-    off_px = float((fast - e.output.depth_mm).abs().max()) / e.unit.sensor.mm_per_pixel
-    return {"value": off_px, "deepest": float(e.output.depth_mm.max())}
 
 
 # ---- the table -----------------------------------------------------------------------------------------------------------------
@@ -417,8 +399,8 @@ CHECKS = (
           "{value:.0f} degrees are in doubt", "note", above=UNSEEN_DEG),
     Check("new_spots", _spots, "{value:.0f} spots that were not there at calibration ({share:.1%} of the image{dead}): clean the "
           "skin, or recalibrate", lambda figures: "warning" if figures["share"] > 0.001 else "note"),
-    Check("skin_changed", _wear, "the skin's brightness has changed by {value:.1%} (RMS), unevenly and nearly equally "
-          "in all channels: worn, stained or dirty, light from outside, or the camera has moved; clean and shade it, or "
+    Check("skin_changed", lambda e: e.grey_change, "the skin's brightness has changed by {value:.1%} (RMS), unevenly and nearly "
+          "equally in all channels: worn, stained or dirty, light from outside, or the camera has moved; clean and shade it, or "
           "recalibrate", above=0.0),
     Check("blurred", _texture_lost, "the image is blurred or moved: {value:.0%} of the skin's fine texture is lost; focus, clean "
           "the lens, mount the camera firmly", above=0.6),
@@ -433,12 +415,8 @@ CHECKS = (
           "the gel has moved in its frame, or all skin is sheared; calibrate again where nothing touches it", "note", above=0.5),
     # the scene
     Check("no_contact", _no_contact, "no contact: nothing is above the noise", "note", last=True),
-    Check("contact_covers_image", lambda e: float(e.moved.double().mean()), "the skin has moved in {value:.0%} of the image: "
-          "little free skin is left to compare with, and depth beyond the border is not seen", "note", above=0.6, alone=True),
     Check("contact_at_border", _at_border, "the contact reaches the image border: the part beyond is not seen, and depth there "
           "is less certain", "note", alone=True),
-    Check("faint_contact", _faint, "faint contact: {value:.3f} mm at its deepest, less than a pixel; its rim is below the noise",
-          "note"),
     Check("steep_walls", _steepest, "walls of {value:.0f} degrees: a light may be blocked there, and integration cannot keep a "
           "step; use precise mode, trust the top only", "note", above=52.0),
     Check("beyond_presses", _beyond_presses, "normals of this contact are expected to be off by {expected:.0f} degrees, "
@@ -449,6 +427,4 @@ CHECKS = (
           "less, or raise the LEDs", lambda figures: "warning" if figures["value"] > 0.3 else "note", above=0.01),
     Check("cast_shadow", _cast_shadow, "a shadow falls on {value:.1%} of the image, on flat skin: modes fast and those of response "
           "fields take it for a slope; use precise mode with known lights, or raise the LEDs", above=0.002),
-    Check("deep_press", _deep_press, "deep press ({deepest:.1f} mm): fast mode is off by {value:.1f} px; use precise",
-          "note", above=0.5),
 )  # fmt: skip

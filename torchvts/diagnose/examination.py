@@ -17,7 +17,7 @@ from ..core.noise import noise_std
 from ..model import Calibration
 from ..model.lights import inverse_light_matrix
 from ..model.usable import FrameCheck
-from ..pipeline import DepthPipeline, usual_unseen_deg
+from ..pipeline import DepthPipeline
 from ..skin import DotMotion, motion_of_unit
 from ..skin.weight import WEIGHT_CELLS, spread_of
 from .camera import levels_of
@@ -31,13 +31,7 @@ LEAST_GREY, GREY_OVER_COLOUR = 0.006, 1.8
 
 @dataclass
 class Examination:
-    """One image, its calibration, and what is measured of them.
-
-    Attributes:
-        unit: the calibration.
-        raw: (3, H, W), the image.
-        given: (3, H, W), an image without contact of now, or None.
-    """
+    """One image (3, H, W), its calibration, an image without contact of now if there is one, and what is measured of them."""
 
     unit: Calibration
     raw: Tensor
@@ -110,11 +104,6 @@ class Examination:
         return (self.frame.weight[0, 0] <= 0.0) & usable
 
     @cached_property
-    def steepness(self) -> Tensor:
-        """(H, W), mm per mm."""
-        return lengths(self.output.gradient[0], 0)
-
-    @cached_property
     def free_deg(self) -> float:
         """Spread of the slopes that the pipeline reads, before it takes them to be none, where the skin has changed least."""
         cells = whole_cell_means(self.frame_and_slopes[1], max(1, min(self.image.shape[1:]) // WEIGHT_CELLS))
@@ -162,11 +151,6 @@ class Examination:
             return self.pipeline.conditions(value[None].to(self.unit.background.dtype))
 
     @cached_property
-    def usual_unseen_deg(self) -> float:
-        """Slope that a frame of the undeformed skin hides at calibration."""
-        return usual_unseen_deg(self.unit, self.pipeline)
-
-    @cached_property
     def calibration_light(self) -> Conditions | None:
         """The light of the background over that of the lights' own image; None where the calibration has only one of them."""
         unit = self.unit
@@ -179,7 +163,7 @@ class Examination:
 
     @cached_property
     def grey_change(self) -> float:
-        """Uneven change of brightness of free skin that the channels share, if they share most of it and it is not noise; else 0.
+        """RMS of an uneven change of brightness of free skin that the channels share, if they share most of it; else 0.
 
         An LED changes one channel; a slope takes light from one channel and gives it to another; dirt takes it from all.
         """
@@ -188,7 +172,7 @@ class Examination:
             light = self.pipeline.compensate(self.raw[None].to(self.unit.background.dtype)) / self.unit.flat.clamp_min(1e-6)
         free = whole_cell_means(self.free[None, None].double(), side)[0, 0] > 0.5
         log = whole_cell_means(light.double(), side)[0].clamp_min(1e-3).log()[:, free]
-        if log.shape[1] < 100:
+        if log.shape[1] < 100 or not self.unit.measured:
             return 0.0
         log = log - log.median(dim=1, keepdim=True).values
         shared = log.mean(0)

@@ -14,12 +14,7 @@ COST_DEG = {"fault": FAULT_DEG, "warning": WARNING_DEG, "note": 0.0}
 
 
 def by_cost(cost_deg: float) -> str:
-    """The severity of an error of normals.
-
-    Example:
-        >>> by_cost(0.1), by_cost(4.0)
-        ('note', 'fault')
-    """
+    """The severity of an error of normals."""
     return "fault" if cost_deg >= FAULT_DEG else "warning" if cost_deg >= WARNING_DEG else "note"
 
 

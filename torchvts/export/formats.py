@@ -32,10 +32,13 @@ OUTPUTS = ("depth_mm", "gradient", "normal", "contact", "deformed")
 
 
 def describe(pipe: DepthPipeline, rectify: Rectify | None = None) -> dict[str, Any]:
-    """The metadata of an exported file: plain JSON."""
+    """The metadata of an exported file, plain JSON; refuses a ``rectify`` that makes images of another size."""
     check_pipeline(pipe)
     height, width, dtype = size_and_dtype(pipe)
-    check_rectify(rectify, (height, width))
+    if rectify is not None:
+        check_record("rectify", rectify, Rectify, "Rectify(calibration.sensor) makes one")
+        if rectify.view.size != (height, width):
+            raise ValueError(f"rectify: expected images of {height} x {width} like the pipeline, got {rectify}: of another sensor?")
     return {
         "torchvts": __version__,
         "torch": str(torch.__version__),
@@ -62,16 +65,6 @@ def check_pipeline(pipe: object) -> None:
         )
 
 
-def check_rectify(rectify: object, size: tuple[int, int]) -> None:
-    """Raise unless ``rectify`` is None, or a Rectify that makes images of ``size``."""
-    if rectify is None:
-        return
-    check_record("rectify", rectify, Rectify, "Rectify(calibration.sensor) makes one")
-    assert isinstance(rectify, Rectify)
-    if rectify.view.size != size:
-        raise ValueError(f"rectify: expected images of {size[0]} x {size[1]} like the pipeline, got {rectify}: of another sensor?")
-
-
 def export_torchscript(pipe: DepthPipeline, path: str | Path, rectify: Rectify | None = None) -> Path:
     """Write a pipeline as TorchScript (.pt), for ``torch.jit.load`` and C++ libtorch. It stays differentiable.
 
@@ -86,11 +79,9 @@ def export_torchscript(pipe: DepthPipeline, path: str | Path, rectify: Rectify |
         TypeError: no pipeline, or no Rectify.
         ValueError: a Rectify that makes images of another size.
     """
-    check_pipeline(pipe)
-    path = check_target(path)
+    path, metadata = check_target(path), {f"{METADATA_KEY}.json": json.dumps(describe(pipe, rectify))}
     with warnings.catch_warnings(), write_atomically(path) as temporary:
         warnings.simplefilter("ignore")  # that TorchScript is deprecated
-        metadata = {f"{METADATA_KEY}.json": json.dumps(describe(pipe, rectify))}
         whole = copy.deepcopy(pipe if rectify is None else torch.nn.Sequential(rectify, pipe)).eval()
         try:
             scripted = torch.jit.script(whole)
@@ -113,14 +104,12 @@ def export_program(
         path: the file; without one the program is returned and not written.
         rectify: as :func:`export_torchscript`; of a sensor of one raw size, since a graph has one.
     Raises:
-        TypeError: no pipeline, or no Rectify.
-        ValueError: a Rectify that makes images of another size, or of frames of several sizes.
+        TypeError, ValueError: as :func:`export_torchscript`.
         Exception: what torch.export raises for a module of yours that it cannot trace.
     """
-    check_pipeline(pipe)
+    metadata = {f"{METADATA_KEY}.json": json.dumps(describe(pipe, rectify))}
     if path is not None:
         check_target(path)
-    metadata = {f"{METADATA_KEY}.json": json.dumps(describe(pipe, rectify))}
     program = trace(pipe, by_matrix=False, rectify=rectify)
     if path is not None:
         with write_atomically(path) as temporary, warnings.catch_warnings():
@@ -142,27 +131,15 @@ def export_onnx(pipe: DepthPipeline, path: str | Path, rectify: Rectify | None =
         ModuleNotFoundError: the extra ``onnx`` is not installed.
         TypeError, ValueError: as :func:`export_program`.
     """
-    check_pipeline(pipe)
-    path = check_target(path)
-    complaint = missing("onnx")
-    if complaint:
+    path, metadata = check_target(path), json.dumps(describe(pipe, rectify))
+    if complaint := missing("onnx"):
         raise ModuleNotFoundError(complaint)
-    metadata = json.dumps(describe(pipe, rectify))
     with InOnnxOperators():
         program = trace(pipe, by_matrix=True, rectify=rectify)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        model = torch.onnx.export(
-            program,
-            dynamo=True,
-            input_names=["images"],
-            output_names=list(OUTPUTS),
-            external_data=False,
-            verbose=False,
-            optimize=False,
-        )
-        if model is None:
-            raise RuntimeError("onnx: the exporter returned no model")
+        names: dict[str, Any] = {"input_names": ["images"], "output_names": list(OUTPUTS)}
+        model: Any = torch.onnx.export(program, dynamo=True, external_data=False, verbose=False, optimize=False, **names)
         simplify(model.model)
         model.model.metadata_props[METADATA_KEY] = metadata
         with write_atomically(path) as temporary:
@@ -172,41 +149,25 @@ def export_onnx(pipe: DepthPipeline, path: str | Path, rectify: Rectify | None =
 
 @dataclass(frozen=True)
 class Format:
-    """A file format.
-
-    Attributes:
-        file_name: name of the file in a folder of exports.
-        write: its writer.
-        tolerance_mm: largest difference of depth to the pipeline, mm.
-    """
+    """A file format: its file in a folder of exports, its writer, and the largest difference of depth to the pipeline, mm."""
 
     file_name: str
     write: Callable[[DepthPipeline, Path], object]
     tolerance_mm: float
 
 
-def _write_plan(pipe: DepthPipeline, path: Path) -> None:
-    pipe.freeze().save(path)
-
-
 FORMATS = {
     "torchscript": Format("pipeline.pt", export_torchscript, 1e-5),
     "pt2": Format("pipeline.pt2", export_program, 1e-5),
     "onnx": Format("pipeline.onnx", export_onnx, 1e-3),
-    "plan": Format("pipeline.plan", _write_plan, 1e-5),
+    "plan": Format("pipeline.plan", lambda pipe, path: pipe.freeze().save(path), 1e-5),
 }
 """The formats by name; the plan is that of :meth:`torchvts.FrozenPipeline.save`, without networks."""
 
 
 def missing(name: str) -> str:
-    """What a format needs and this machine lacks, as a sentence; empty if nothing.
-
-    Raises:
-        ValueError: unknown format.
-    """
+    """What a format needs and this machine lacks, as a sentence; empty if nothing; ValueError for an unknown format."""
     check_choice("format", name, list(FORMATS))
-    if name == "onnx":
-        absent = [package for package in ("onnx", "onnxscript", "onnxruntime") if find_spec(package) is None]
-        if absent:
-            return f"onnx: {', '.join(absent)} not found: pip install 'torchvts[onnx]'"
-    return ""
+    needed = ("onnx", "onnxscript", "onnxruntime") if name == "onnx" else ()
+    absent = [package for package in needed if find_spec(package) is None]
+    return f"onnx: {', '.join(absent)} not found: pip install 'torchvts[onnx]'" if absent else ""

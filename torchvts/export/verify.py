@@ -24,13 +24,7 @@ from .formats import FORMATS, check_pipeline
 
 
 def sample_frames(calibration: Calibration) -> Tensor:
-    """Four frames of a unit to compare exports on, 8 bits with noise: one contact, none, two contacts, and random values.
-
-    Args:
-        calibration: the unit.
-    Returns:
-        (4, 3, H, W) in [0, 1], of the calibration's dtype.
-    """
+    """Frames of a unit to compare exports on, (4, 3, H, W), 8 bits: one contact, none, two contacts, and random values."""
     check_calibration("calibration", calibration)
     random = torch.Generator().manual_seed(0)
     height, width, pitch = calibration.sensor.height, calibration.sensor.width, calibration.sensor.mm_per_pixel
@@ -57,9 +51,7 @@ class ExportCheck:
     """The result of an export.
 
     Attributes:
-        format: name of the format.
-        path: the file.
-        size_kb: its size, kB; NaN without a file.
+        size_kb: size of the file, kB; NaN without one.
         difference_mm: largest difference of depth to the pipeline, mm; NaN if it could not be compared.
         reason: why the export failed; empty if it did not.
     """
@@ -77,17 +69,15 @@ class ExportCheck:
 
 
 def export_checked(pipe: DepthPipeline, folder: str | Path, formats: Sequence[str], images: Tensor) -> list[ExportCheck]:
-    """Write a pipeline in several formats, and check each file by :func:`compare`.
+    """Write a pipeline in several formats, and check each file by :func:`compare`: one row per format.
 
     A format that fails, by whatever exception, does not keep the others from being written; its row gives the reason.
 
     Args:
         pipe: the pipeline.
         folder: where to write; made if it does not exist.
-        formats: names from FORMATS.
-        images: (B, 3, H, W), B at least 3.
-    Returns:
-        One row per format.
+        formats: names from :data:`FORMATS`.
+        images: (B, 3, H, W).
     Raises:
         ValueError: unknown format.
     """
@@ -102,29 +92,23 @@ def export_checked(pipe: DepthPipeline, folder: str | Path, formats: Sequence[st
 
 
 def _export_one(pipe: DepthPipeline, folder: Path, name: str, images: Tensor) -> ExportCheck:
-    path, tolerance_mm = folder / FORMATS[name].file_name, FORMATS[name].tolerance_mm
-    difference, reason = math.nan, ""
+    form, difference, reason = FORMATS[name], math.nan, ""
+    path = folder / form.file_name
     try:
-        FORMATS[name].write(pipe, path)
+        form.write(pipe, path)
         difference = compare(path, pipe, images, name)
     except Exception as error:
         reason = (str(error).strip() or type(error).__name__).splitlines()[0]
-    if difference > tolerance_mm:
-        reason = f"depth is {difference:.3g} mm off, at most {tolerance_mm:g} is allowed"
+    if difference > form.tolerance_mm:
+        reason = f"depth is {difference:.3g} mm off, at most {form.tolerance_mm:g} is allowed"
     return ExportCheck(name, path, path.stat().st_size / 1024 if path.is_file() else math.nan, difference, reason)
 
 
 def compare(path: str | Path, pipe: DepthPipeline, images: Tensor, name: str) -> float:
     """Largest difference of depth, mm, between an exported file and the pipeline, over batches of 1, 2, 3 and all images.
 
-    The file is run by a process in which torchvts cannot be imported, the pipeline in this one; a plan by this one's compiled
-    library.
+    The file of format ``name`` is run by a process in which torchvts cannot be imported, a plan by the compiled library here.
 
-    Args:
-        path: the file.
-        pipe: the pipeline from which it was made.
-        images: (B, 3, H, W).
-        name: its format.
     Raises:
         RuntimeError: the process failed; the message ends with the last line of its output.
         FileNotFoundError: no such file.
@@ -145,15 +129,8 @@ def compare(path: str | Path, pipe: DepthPipeline, images: Tensor, name: str) ->
 
 
 def run_bare(path: str | Path, images: Tensor, name: str, batches: Sequence[int]) -> list[Tensor]:
-    """Depth by an exported file, from a process without torchvts.
+    """Depth (n, 1, H, W), mm, of the first n images (B, 3, H, W), for each n of ``batches``, from a process without torchvts.
 
-    Args:
-        path: the file.
-        images: (B, 3, H, W).
-        name: its format.
-        batches: the file is run on that many images, from the first on, once for each.
-    Returns:
-        Depth (n, 1, H, W), mm, for each n of ``batches``.
     Raises:
         RuntimeError: the process failed.
         FileNotFoundError: no such file.

@@ -2,13 +2,7 @@
 
 from ..model.usable import FrameCheck
 from . import messages
-from .background import (
-    FIRST_FRAMES,
-    find_background,
-    read_background,
-    read_press_images,
-    with_background,
-)
+from .background import FIRST_FRAMES, find_background, read_background, read_press_images, with_background
 from .cameras import Camera, CameraSettings
 from .devices import find_camera
 from .files import StreamReport

@@ -9,11 +9,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from ..calibration import (
-    ROUGH,
-    Press,
-    channel_structure,
-)
+from ..calibration import ROUGH, Press, channel_structure
 from ..core.blur import band_of_ratios, without_margin
 from ..core.cells import whole_cell_means
 from ..core.checks import check_batch, check_image, check_integer, check_path, check_positive, check_sequence, parse_number
@@ -33,29 +29,13 @@ more, the skin far from them up to 0.035."""
 ROUGH_DEG = 3.3
 """Slopes for which a prior takes the structure of an image; more is a contact."""
 
-WITHOUT_FIRST = (
-    "start without contact, or use the background of a calibration (--calibration with --background-frames 0; background_frames=0)"
-)
-"""What to do where the first frames show contact."""
-
 
 def find_background(images: Tensor, sensor: Sensor | None = None) -> Tensor:
     """Find the image of the skin without contact in the first frames, or refuse and say why.
 
-    The image is the median over the frames, averaged with the half of the values next to it. The frames are divided into cells of
-    1/20 of their height, and the cells by their median over time. Refused are
-
-    * frames whose level (median over the cells) changes by more than 2 % in a channel: the light changes;
-    * frames in which three cells or more differ from the level by more than 2 %, by 8 times the spread of all cells (median
-      absolute deviation) and by 4 times their own median change from frame to frame: something moves, or a contact begins;
-    * frames with structure between the channels. The fall-off of an LED is smooth, and a spot is dark in all channels; a contact is
-      bright in one channel where it is dark in another, within a few millimetres. The log ratios of the channels, band-passed
-      (Gaussians of 1/40 and 1/16 of the height), are below 0.11 at the 99th percentile without contact on every sensor at hand
-      (0.01 to 0.03 on four of six; 0.10 on a Wedge, whose LEDs are in the picture), and 0.06 to 0.36 under clear contact; 0.13 is
-      refused. So a faint contact that stays from the first frame to the last is not found: without a calibration it cannot be
-      distinguished from the skin;
-    * with a sensor that has a prior, frames whose structure the prior takes for slopes of more than 3.3 degrees at the 99th
-      percentile (1.8 to 2.2 on three units of the GelSight Mini without contact, 3.2 to 15 under balls).
+    The image is the median over the frames, averaged with the half of the values next to it. Refused are changing light, movement,
+    and structure between the channels: the fall-off of an LED is smooth, and a spot is dark in all channels; a contact is bright in
+    one channel where it is dark in another. docs/streaming.md has the limits. A faint contact in all frames is not found.
 
     Args:
         images: (N, 3, H, W) in [0, 1], rectified, at least 3.
@@ -77,24 +57,18 @@ def find_background(images: Tensor, sensor: Sensor | None = None) -> Tensor:
     rank = images.sort(0).values
     quarter = len(images) // 4
     image = _in_16_bits(rank[quarter : len(images) - quarter].mean(0))
-    structure = channel_structure(image)
-    if structure > ROUGH:
+    seen = ""
+    if (structure := channel_structure(image)) > ROUGH:
+        seen = f"between the channels of {structure:.3f}, without contact it is below {ROUGH}"
+    elif sensor is not None and sensor.prior is not None and (deg := _structure_deg(image, sensor, sensor.prior)) > ROUGH_DEG:
+        seen = f"that looks like slopes of {deg:.1f} degrees, without contact it is below {ROUGH_DEG:g}"
+    if seen:
+        other = "" if sensor is None else f", or the frames are not those of a sensor '{sensor.name}'"
         raise ValueError(
-            f"background: the first {len(images)} frames show structure between the channels of {structure:.3f}, without contact "
-            f"it is below {ROUGH}: something touches the skin{_or_other(sensor)}; {WITHOUT_FIRST}"
+            f"background: the first {len(images)} frames show structure {seen}: something touches the skin{other}; start without "
+            "contact, or use the background of a calibration file (--background-frames 0; background_frames=0)"
         )
-    if sensor is not None and sensor.prior is not None:
-        slope_deg = _structure_deg(image, sensor, sensor.prior)
-        if slope_deg > ROUGH_DEG:
-            raise ValueError(
-                f"background: the first {len(images)} frames show structure that looks like slopes of {slope_deg:.1f} degrees, "
-                f"without contact it is below {ROUGH_DEG:g}: something touches the skin{_or_other(sensor)}; {WITHOUT_FIRST}"
-            )
     return image
-
-
-def _or_other(sensor: Sensor | None) -> str:
-    return "" if sensor is None else f", or the frames are not those of a sensor '{sensor.name}'"
 
 
 def _structure_deg(image: Tensor, sensor: Sensor, prior: SensorPrior) -> float:
@@ -118,9 +92,7 @@ FIRST_FRAMES = 12
 def read_background(paths: Sequence[str | Path], sensor: Sensor, first_frames: int = FIRST_FRAMES) -> Tensor:
     """The image without contact from files, rectified, (3, height, width).
 
-    * One image: as it is.
-    * Several images: the median of each pixel. Contacts vanish from it where each pixel is free of contact in most of the images.
-    * A video, or a TIFF of several pages: its first frames, by :func:`find_background`, which refuses those with contact.
+    One image is taken as it is, several by the median of each pixel, and a film's first frames by :func:`find_background`.
 
     Args:
         paths: one or more images, or one video.
@@ -138,7 +110,7 @@ def read_background(paths: Sequence[str | Path], sensor: Sensor, first_frames: i
     if any(is_film(file) for file in files):
         if len(files) > 1:
             raise ValueError(f"background: expected images or one video, got {len(files)} files with a video among them")
-        return _background_of_video(files[0], sensor, first_frames)
+        return _background_of_film(files[0], sensor, first_frames)
     images = torch.stack([sensor.read_image(file) for file in files])
     if len(images) == 1:
         return images[0]
@@ -146,7 +118,7 @@ def read_background(paths: Sequence[str | Path], sensor: Sensor, first_frames: i
     return _in_16_bits(rank[(len(images) - 1) // 2 : len(images) // 2 + 1].mean(0))
 
 
-def _background_of_video(path: Path, sensor: Sensor, first_frames: int) -> Tensor:
+def _background_of_film(path: Path, sensor: Sensor, first_frames: int) -> Tensor:
     try:
         first = [sensor.rectify(image[None]).clamp(0.0, 1.0) for _, image in islice(frames(path), first_frames)]
         if len(first) < first_frames:
@@ -164,16 +136,14 @@ def read_press_images(presses: Sequence[tuple[str | Path, float | str]], sensor:
         ValueError: not an image, a size that the sensor does not accept, or no diameter; names the file.
     """
     found = []
-    names = [Path(path).name for path, _ in presses]
-    if len(set(names)) < len(names):  # gs_sdk calls every image gelsight.png
-        names = [str(path) for path, _ in presses]
-    for name, (path, diameter) in zip(names, presses):
+    alike = len({Path(path).name for path, _ in presses}) < len(presses)  # gs_sdk calls every image gelsight.png
+    for path, diameter in presses:
         try:
             diameter_mm = check_positive("press", parse_number(diameter) if isinstance(diameter, str) else diameter)
         except (TypeError, ValueError):
             hint = ": write a decimal point" if "," in str(diameter) else ""
             raise ValueError(f"press: expected the diameter of the ball in mm after {path}, got {diameter!r}{hint}") from None
-        found.append(Press(sensor.read_image(path), diameter_mm, name))
+        found.append(Press(sensor.read_image(path), diameter_mm, str(path) if alike else Path(path).name))
     return found
 
 
@@ -191,7 +161,11 @@ def _cells(images: Tensor) -> Tensor:
 
 
 def check_steady(images: Tensor) -> None:
-    """Raise ValueError where the light changes or something moves in frames (N, 3, H, W); as :func:`find_background`."""
+    """Raise ValueError where the light changes or something moves in frames (N, 3, H, W).
+
+    The light changes where the level of a channel, its median over cells of 1/20 of the frame, does by :data:`MOVED`. Something
+    moves where three cells differ from the level by that, by 8 times the spread of all cells, and by 4 times their own flicker.
+    """
     cells = _cells(images)
     ratio = cells / cells.median(0, keepdim=True).values
     level = ratio.flatten(2).median(2).values  # (N, 3)
@@ -220,11 +194,8 @@ def check_steady(images: Tensor) -> None:
 
 
 def with_background(calibration: Calibration, background: Tensor) -> Calibration:
-    """The calibration with another image without contact: defects, gain and noise come from it, lights or response fields stay.
+    """The calibration with another image (3, H, W) without contact, which gives defects, gain and noise; the model stays.
 
-    Args:
-        calibration: of the unit.
-        background: (3, H, W) in [0, 1].
     Raises:
         ValueError, TypeError: background of another shape or range.
     Example:

@@ -5,12 +5,7 @@ from typing import NamedTuple
 
 
 class Device(NamedTuple):
-    """A camera that Linux lists.
-
-    Attributes:
-        node: index of its first node, which gives the frames.
-        names: its own name, then those under /dev/v4l/by-id, which have its serial number.
-    """
+    """A camera that Linux lists: index of its first node, its name and those under /dev/v4l/by-id, with its serial number."""
 
     node: int
     names: tuple[str, ...]
@@ -49,14 +44,12 @@ def found_cameras(root: Path = Path("/")) -> str:
 
 
 def find_camera(source: str, root: Path = Path("/")) -> int | None:
-    """Index of the camera that a text names; None if none does.
+    """Index of the camera that a text names; None if none does, ValueError where several have that name.
 
     Args:
         source: an index in digits, a path such as /dev/video2 or one below /dev/v4l, or, under Linux, a part of the device's name
             or of its name in /dev/v4l/by-id, such as the serial number.
         root: where Linux lists devices.
-    Raises:
-        ValueError: several cameras have that name; names them.
     """
     if source.isascii() and source.isdigit():
         return int(source)

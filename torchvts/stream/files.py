@@ -35,8 +35,7 @@ class StreamReport:
     Args:
         stream: whose frames are added.
         motion: also how the object moves that drags the skin, by its printed dots (:class:`torchvts.SkinMotion`): its shift, its
-            turn, and the share of the contact that sticks. The time grows with the dots:
-            230 take a second a frame.
+            turn, and the share of the contact that sticks.
     Raises:
         ValueError: ``motion`` of a skin without dots.
     """
@@ -67,19 +66,13 @@ class StreamReport:
             with self.stream.stages.stage("motion"):
                 self._of_object.append(self._object(self._follow, frame))
         dropped = f", {self.stream.dropped} dropped" if self.stream.dropped else ""
-        times = [f"{name} {ms:.1f}" for name, ms in self.stream.stages.last.items()]
-        half = (len(times) + 1) // 2
         in_doubt = "  IN DOUBT" if doubt else ""
-        return [
-            f"frame {frame.number}  {frame.time_s:.2f} s  contact {area:.1f} mm2  deepest {deepest:.2f}{in_doubt}",
-            f"{self.fps:.0f} fps{dropped}, ms: {' '.join(times[:half])}",
-            " ".join(times[half:]),
-        ]
+        figures = f"contact {area:.1f} mm2  deepest {deepest:.2f}{in_doubt}"
+        return [f"frame {frame.number}  {frame.time_s:.2f} s  {figures}", f"{self.fps:.0f} fps{dropped}"]
 
     def _object(self, follow: SkinMotion, frame: TactileFrame) -> list[float]:
         """Shift, turn and stuck share of the object; NaN without contact."""
-        image = frame.image.reshape(1, *frame.image.shape[-3:])
-        self._moved = follow(image, frame.output.depth_mm, self._moved)
+        self._moved = follow(frame.image[None], frame.output.depth_mm, self._moved)
         slip = self._moved.slip(frame.output.contact)
         return [*slip.shift_mm[0].tolist(), float(slip.turn_deg[0]), float(slip.stuck_share[0])]
 
@@ -94,7 +87,7 @@ class StreamReport:
         return sum(row[6] != "" for row in self.rows)
 
     def summary(self) -> dict[str, Any]:
-        """For JSON: :func:`summary_of`, frames and dropped ones, fps, stages_ms, contact, last light, frames in doubt."""
+        """For JSON: :func:`summary_of`, frames and dropped ones, fps, stages_ms, contact, frames in doubt."""
         stream = self.stream
         return {
             **summary_of(stream, len(self.rows)),
@@ -103,7 +96,6 @@ class StreamReport:
             "stages_ms": {name: round(ms, 3) for name, ms in stream.stages.median_ms().items()},
             "contact_frames": sum(row[2] > 0 for row in self.rows),
             "deepest_mm": max((row[3] for row in self.rows), default=0.0),
-            "light_level": [round(v, 5) for v in self.rows[-1][4]] if self.rows else [],
             "doubted_frames": self.doubted,
         }
 
@@ -119,8 +111,6 @@ class StreamReport:
         if moved := [row for row in self._of_object if not math.isnan(row[0])]:
             shift, turn = max(math.hypot(*row[:2]) for row in moved), max(abs(row[2]) for row in moved)
             lines.append(f"the object moved the skin in {len(moved)} frames, by at most {shift:.3f} {unit} and {turn:.1f} degrees")
-        if values["light_level"]:
-            lines.append("light at the end, R G B: " + " ".join(f"{v:.3f}" for v in values["light_level"]) + " of the background's")
         if values["doubted_frames"]:
             first = next(row for row in self.rows if row[6])
             count = f"{values['doubted_frames']} of {values['frames']} frames"

@@ -15,24 +15,13 @@ from ..core.files import Pixels, rgb_from_bgr
 from ..model import Calibration, Sensor
 from ..pipeline import MODES, Conditions, DepthOutput
 from ..skin import ContactSettings
-from .background import (
-    FIRST_FRAMES,
-    find_background,
-    with_background,
-)
+from .background import FIRST_FRAMES, find_background, with_background
 from .cameras import AS_IT_IS, CameraSettings
 from .numbered import SourceFrames
 from .record import Recorder
 from .recording import NotAtRest, Recording
 from .sources import LiveReader, Reader, Unreadable, check_reader, open_source
 from .stages import StageClock
-
-UNKNOWN_LIGHT = (
-    "background: how sensor '{0}' is lit cannot be found in its first {1} frames alone: press a ball of known diameter at some "
-    "places, and give the images: torchvts calibrate background.png --sensor FILE --press ball.png 6.31 --press ... makes what "
-    "--calibration takes (presses=[...] in Python)"
-)
-"""What is said where the first frames, taken for the background, fit the model that was found in them badly."""
 
 
 class TactileFrame(NamedTuple):
@@ -54,11 +43,9 @@ class TactileFrame(NamedTuple):
 class TactileStream:
     """Depth of every frame of a camera, a video or a folder of images.
 
-    The first frames must be without contact (:func:`find_background`). Without a calibration the unit is calibrated from them
-    (:func:`torchvts.calibrate`), and ``print(stream.calibration)`` says what speaks against it; with one they are compared with its
-    background. Then each frame is rectified and goes the way of :class:`Recording`, which data sets share. Of cameras, and of
-    recordings with ``realtime``, only the newest frame is taken and late ones are dropped; of other recordings all are. A frame
-    that cannot be used (:class:`FrameCheck`) is left out.
+    The first frames must be without contact (:func:`find_background`). Without a calibration the unit is calibrated from them; with
+    one they are compared with its background. Then each frame is rectified and goes the way of :class:`Recording`. Of cameras, and
+    of recordings with ``realtime``, late frames are dropped. A frame that cannot be used (:class:`FrameCheck`) is left out.
 
     Args:
         source: a camera (:func:`find_camera`), a network camera's URL, a video file, a folder of images, or a :class:`Reader`.
@@ -114,13 +101,16 @@ class TactileStream:
         self.left_out: list[tuple[int, str]] = []
         self._zero: list[Tensor] = []
         self._doubted = False
-        self._zero_missing = 0
+        self._zero_frames = 0
         self.recorder: Recorder | None = None
         self._frames = SourceFrames(_reader_of(source, reconnect_s, settings), realtime, self.stages)
-        self._begin = partial(Recording, mode=mode, network=network, device=device, contact=contact, stage=self.stages.stage)
+        self._begin = partial(Recording, mode=mode, network=network, device=device, contact=contact)
         try:
             if record is not None:
-                self._record(record)
+                if not isinstance(self.reader, LiveReader):
+                    raise ValueError(f"record: expected a camera, got {self.reader.name}: it is a recording already")
+                self.recorder = Recorder(record, self.fps)
+                self.reader.keep = self.recorder.add
             readable = self._frames.read_first(background_frames)
             self._size = readable[0].shape[:2]
             first = torch.cat([self._rectified(pixels) for pixels in readable])
@@ -128,16 +118,13 @@ class TactileStream:
             self.recording = self._begin(self.calibration, first=first if background_frames > 0 else None)
         except BaseException as error:
             self.close()
-            if isinstance(error, NotAtRest) and isinstance(sensor_or_calibration, Sensor):  # what these frames made fits none
-                raise ValueError(UNKNOWN_LIGHT.format(self._sensor.name, int(background_frames))) from error
+            if isinstance(error, NotAtRest) and isinstance(sensor_or_calibration, Sensor):  # the model that these frames made
+                raise ValueError(
+                    f"background: how sensor '{self._sensor.name}' is lit cannot be found in its first {background_frames} frames "
+                    "alone: press a ball of known diameter at some places, and give the images: torchvts calibrate background.png "
+                    "--sensor FILE --press ball.png 6.31 --press ... (presses=[...] in Python)"
+                ) from error
             raise
-
-    def _record(self, path: str | Path) -> None:
-        """Record the camera from now on."""
-        if not isinstance(self.reader, LiveReader):
-            raise ValueError(f"record: expected a camera, got {self.reader.name}: it is a recording already")
-        self.recorder = Recorder(path, self.fps)
-        self.reader.keep = self.recorder.add
 
     def _rectified(self, pixels: Pixels) -> Tensor:
         frame = rgb_from_bgr(pixels)[None]
@@ -147,23 +134,18 @@ class TactileStream:
         return found if found is frame else found.clamp(0.0, 1.0)
 
     def rezero(self, frames: int = FIRST_FRAMES) -> None:
-        """Take the next frames, which must be without contact, as the background; until then depth goes on as before.
+        """Take the next ``frames``, at least 3, which must be without contact, as the background.
 
-        Where contact or changing light is seen in them, a warning says so and the background stays.
-
-        Args:
-            frames: number of frames, at least 3.
+        Until then depth goes on as before. Where contact or changing light is seen, a warning says so and the background stays.
         """
-        self._zero, self._zero_missing = [], check_integer("frames", frames, 3)
+        self._zero, self._zero_frames = [], check_integer("frames", frames, 3)
 
     def _collect(self, raw: Tensor) -> None:
         """Keep a frame for the new background, and change to it when there are enough."""
         self._zero.append(raw)
-        self._zero_missing -= 1
-        if self._zero_missing > 0:
+        if len(self._zero) < self._zero_frames:
             return
-        first = torch.cat(self._zero)
-        self._zero = []
+        first, self._zero, self._zero_frames = torch.cat(self._zero), [], 0
         try:
             background = find_background(first, self.calibration.sensor).clamp(0.0, 1.0)
             calibration = with_background(self.calibration, background)
@@ -220,31 +202,31 @@ class TactileStream:
 
     def __iter__(self) -> Iterator[TactileFrame]:
         for index, time_s, pixels in self._frames:
-            with self.stages.stage("rectify"):
-                raw, reason = self._usable(pixels)
-            if raw is not None and self._zero_missing:
-                self._collect(raw)
-            if raw is None:
-                self.left_out.append((index, reason))
-                warnings.warn(f"frame {index} left out: {reason}", stacklevel=2)
+            try:
+                with self.stages.stage("rectify"):
+                    raw = self._usable(pixels)
+            except ValueError as error:
+                self.left_out.append((index, str(error)))
+                warnings.warn(f"frame {index} left out: {error}", stacklevel=2)
                 continue
-            output = self.recording(raw)
+            if self._zero_frames:
+                self._collect(raw)
+            with self.stages.stage("depth"):
+                output = self.recording(raw)
             if self.doubt and not self._doubted:
                 warnings.warn(f"frame {index}: {self.doubt}", stacklevel=2)
             self._doubted = bool(self.doubt)
             yield TactileFrame(index, time_s, raw[0], output)
             self.stages.end_frame()
 
-    def _usable(self, pixels: Pixels | Unreadable) -> tuple[Tensor | None, str]:
-        """A frame rectified; or None, and why it cannot be used."""
+    def _usable(self, pixels: Pixels | Unreadable) -> Tensor:
+        """A frame rectified; ValueError where it cannot be used."""
         if isinstance(pixels, Unreadable):
-            return None, pixels.reason
-        try:
-            raw = self._rectified(pixels)
-        except ValueError as error:
-            return None, str(error)
-        reason = self.recording.unusable(raw)
-        return (None, reason) if reason else (raw, "")
+            raise ValueError(pixels.reason)
+        raw = self._rectified(pixels)
+        if reason := self.recording.unusable(raw):
+            raise ValueError(reason)
+        return raw
 
 
 def _sensor_of(unit: Sensor | Calibration, background_frames: int, presses: Sequence[Press]) -> Sensor:
@@ -276,6 +258,6 @@ def _reader_of(source: str | int | Path | Reader, reconnect_s: float, settings: 
         return open_source(source, reconnect_s, settings)
     if check_least("reconnect_s", reconnect_s) > 0:
         raise ValueError(f"reconnect_s: expected 0 with a reader of your own, got {reconnect_s:g}: it must reconnect by itself")
-    if settings.given:
+    if settings != AS_IT_IS:
         raise ValueError(f"settings: expected none with a reader of your own, got {settings}: it must ask the driver by itself")
     return check_reader(source)

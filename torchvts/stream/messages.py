@@ -54,13 +54,7 @@ LEROBOT_DEPTH = {"depth_min": -0.0001, "depth_max": 0.004, "use_log": False}
 
 @dataclass(frozen=True)
 class Header:
-    """The fields of ``std_msgs/Header``, the stamp as its two integers.
-
-    Attributes:
-        sec: seconds of the stamp.
-        nanosec: nanoseconds beyond these, 0 to 999,999,999.
-        frame_id: name of the coordinate frame.
-    """
+    """The fields of ``std_msgs/Header``, the stamp as its two integers: seconds, and nanoseconds beyond these."""
 
     sec: int
     nanosec: int
@@ -69,17 +63,7 @@ class Header:
 
 @dataclass(frozen=True)
 class ImageMessage:
-    """The fields of ``sensor_msgs/Image``.
-
-    Attributes:
-        header: stamp and frame.
-        height: rows.
-        width: columns.
-        encoding: "rgb8", or "32FC1" for depth in metres (REP 118).
-        is_bigendian: 0.
-        step: bytes of a row.
-        data: step * height bytes, row by row.
-    """
+    """The fields of ``sensor_msgs/Image``; ``step`` are the bytes of a row."""
 
     header: Header
     height: int
@@ -102,18 +86,9 @@ class PointField:
 
 @dataclass(frozen=True)
 class CloudMessage:
-    """The fields of ``sensor_msgs/PointCloud2``, of a cloud in one row.
+    """The fields of ``sensor_msgs/PointCloud2``, of a cloud in one row: ``height`` is 1, and ``width`` the number of points.
 
-    Attributes:
-        header: stamp and frame.
-        height: 1.
-        width: number of points; 0 without contact.
-        fields: of a point, in the order of :data:`POINT_FIELDS` or :data:`DOT_FIELDS`.
-        is_bigendian: False.
-        point_step: bytes of a point.
-        row_step: bytes of all points.
-        data: row_step bytes.
-        is_dense: whether no point is NaN.
+    ``fields`` are those of :data:`POINT_FIELDS` or :data:`DOT_FIELDS`; ``is_dense``: no point is NaN.
     """
 
     header: Header
@@ -128,12 +103,8 @@ class CloudMessage:
 
 
 def header(frame: TactileFrame, frame_id: str, start_s: float = 0.0) -> Header:
-    """Stamp of a frame.
+    """Stamp of a frame, of the sensor's coordinate frame ``frame_id``; ``start_s`` is when the stream started, 0 counts from then.
 
-    Args:
-        frame: of a :class:`TactileStream`.
-        frame_id: name of the sensor's coordinate frame.
-        start_s: the time at which the stream started, s; 0 counts from its start.
     Raises:
         ValueError: a time below zero, or not finite.
     """
@@ -145,20 +116,14 @@ def header(frame: TactileFrame, frame_id: str, start_s: float = 0.0) -> Header:
 
 
 def image_message(frame: TactileFrame, frame_id: str = "tactile", start_s: float = 0.0) -> ImageMessage:
-    """The camera's image, rectified, 8 bits of R, G, B, encoding "rgb8".
-
-    Arguments are those of :func:`header`.
-    """
+    """The camera's image, rectified, 8 bits of R, G, B, encoding "rgb8"; arguments as of :func:`header`."""
     pixels = _rgb8(frame.image)
     height, width, _ = pixels.shape
     return ImageMessage(header(frame, frame_id, start_s), height, width, "rgb8", 0, 3 * width, pixels.tobytes())
 
 
 def depth_message(frame: TactileFrame, frame_id: str = "tactile", start_s: float = 0.0) -> ImageMessage:
-    """Depth in metres, as ROS wants it: how far the skin is pressed in, not the distance to the camera.
-
-    Encoding "32FC1", little-endian. Arguments are those of :func:`header`.
-    """
+    """How far the skin is pressed in, metres (REP 118), encoding "32FC1", little-endian; arguments as of :func:`header`."""
     depth_m = (1e-3 * _numpy(frame.output.depth_mm)[0, 0]).astype("<f4")
     height, width = depth_m.shape
     return ImageMessage(header(frame, frame_id, start_s), height, width, "32FC1", 0, 4 * width, depth_m.tobytes())
@@ -287,7 +252,7 @@ def record_episode(
     try:
         for frame in frames:
             if motion is not None:
-                moved = motion(frame.image.reshape(1, *frame.image.shape[-3:]), frame.output.depth_mm, moved)
+                moved = motion(frame.image[None], frame.output.depth_mm, moved)
             dataset.add_frame({**lerobot_frame(frame, mm_per_pixel, name, moved), "task": task})
             count += 1
     finally:

@@ -10,12 +10,7 @@ from .stages import StageClock
 
 
 class Played:
-    """A recording at its own rate, as if it were a camera: a frame is given when it is due.
-
-    Args:
-        reader: of the recording.
-        first: frames that were read before, which come first.
-    """
+    """A recording at its own rate, as if it were a camera: a frame is given when it is due; ``first`` were read before."""
 
     live = False
 
@@ -37,18 +32,10 @@ class Played:
 
 
 class SourceFrames:
-    """Frames of a source in order: first some that can be read, then all that it has by iteration.
+    """Frames of a source in order: first some that can be read, then all that it has by iteration, the first ones again.
 
-    A recording gives the first ones again. Of a live source, or a recording that is played at its own rate, only the newest
-    frame is given.
-
-    Args:
-        reader: the source.
-        realtime: play a recording at its own rate.
-        stages: measures reading and waiting.
-    Attributes:
-        started_s: time 0 of the frames, by :func:`time.monotonic`.
-        first: the frames that :meth:`read_first` read.
+    Of a live source, or a recording that is played at its own rate (``realtime``), only the newest frame is given. ``started_s`` is
+    time 0 of the frames, by :func:`time.monotonic`.
     """
 
     def __init__(self, reader: Reader, realtime: bool, stages: StageClock) -> None:
@@ -59,20 +46,16 @@ class SourceFrames:
         self.first: deque[Pixels | Unreadable] = deque()
 
     def read_first(self, least: int) -> list[Pixels]:
-        """Read the first frames, until ``least``, or one, can be read; these.
-
-        Raises:
-            ValueError: the source has fewer.
-        """
-        readable: list[Pixels] = []
-        while len(readable) < max(1, least) and (pixels := self.reader.read()) is not None:
+        """Read the first frames, until ``least``, or one, can be read; these. ValueError where the source has fewer."""
+        readable, least = list[Pixels](), max(1, least)
+        while len(readable) < least and (pixels := self.reader.read()) is not None:
             if not isinstance(pixels, Unreadable):
                 check_pixels(f"source: frame {len(self.first)} of {self.reader.name}", pixels)
                 readable.append(pixels)
             self.first.append(pixels)
-        if len(readable) < max(1, least):
+        if len(readable) < least:
             raise ValueError(
-                f"background_frames: expected at least {max(1, least)} frames from {self.reader.name}, got {len(readable)}: ask "
+                f"background_frames: expected at least {least} frames from {self.reader.name}, got {len(readable)}: ask "
                 "for fewer, or for 0, which keeps a calibration's background (--background-frames)"
             )
         return readable

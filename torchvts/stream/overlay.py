@@ -22,17 +22,16 @@ class Overlay:
     below zero has another one (:func:`torchvts.viz.depth_colors`).
 
     Args:
+        mm_per_pixel: pixel pitch, mm.
         metric: whether depth is in mm; otherwise the overlay says that it is not.
-        mm_per_pixel: pixel pitch, mm, for a scale in the image; None draws none.
     """
 
     TEXT_HEIGHT = 86
 
-    def __init__(self, metric: bool = True, mm_per_pixel: float | None = None) -> None:
+    def __init__(self, mm_per_pixel: float, metric: bool = True) -> None:
         from ..viz import depth_colors  # Matplotlib is slow to import
 
-        self.metric, self.range_mm = metric, 0.1
-        self.mm_per_pixel = None if mm_per_pixel is None else check_positive("mm_per_pixel", mm_per_pixel)
+        self.mm_per_pixel, self.metric, self.range_mm = check_positive("mm_per_pixel", mm_per_pixel), metric, 0.1
         colors, _ = depth_colors(-1.0, 1.0)
         self._table = np.ascontiguousarray((255.0 * colors(np.linspace(0.0, 1.0, 256))[:, None, 2::-1] + 0.5).astype(np.uint8))
         self._line = np.where(self._table.mean(2, keepdims=True) < 128, 255, 60).astype(np.uint8).repeat(3, 2)
@@ -64,7 +63,9 @@ class Overlay:
         import cv2
 
         height, width = frame.image.shape[1:]
-        left, right = _outlined(frame), self.depth(frame.output.depth_mm)
+        left = np.ascontiguousarray((frame.image.flip(0).permute(1, 2, 0) * 255.0 + 0.5).to(torch.uint8).numpy())
+        cv2.drawContours(left, outlines(frame.output.contact[0, 0].numpy()), -1, (255, 255, 255), 1, cv2.LINE_AA)
+        right = self.depth(frame.output.depth_mm)
         larger = -(-300 // width)
         height, width = height * larger, width * larger
         out = np.zeros((height + self.TEXT_HEIGHT + height % 2, 2 * width, 3), np.uint8)
@@ -72,24 +73,17 @@ class Overlay:
             if larger > 1:
                 picture = cv2.resize(picture, (width, height), interpolation=cv2.INTER_NEAREST)
             out[:height, x : x + width] = picture
-        if self.mm_per_pixel is not None:
-            _draw_scale(out, self.mm_per_pixel / larger, width, height)
-        self._draw_bar(out, width + 6, height + 8, width - 12)
+        _draw_scale(out, self.mm_per_pixel / larger, width, height)
+        out[height + 8 : height + 18, width + 6 : -6] = cv2.resize(self._table[128:].transpose(1, 0, 2), (width - 12, 10))
+        end = f"{self.range_mm:g} mm"
+        _write(out, "0", (width + 6, height + 34))
+        _write(out, end, (2 * width - 6 - 8 * len(end), height + 34))
         unit = "mm" if self.metric else "mm, NOT METRIC"
         texts = [f"depth 0 to {self.range_mm:g} {unit}, a line every {self.range_mm / 10:g}", *lines]
         shown = [part for text in texts for part in _wrapped(text, width - 12)][:4]
         for k, line in enumerate(shown):
             _write(out, line, (6, height + 18 + 20 * k))
         return out
-
-    def _draw_bar(self, out: Pixels, x: int, y: int, width: int) -> None:
-        """The colours from zero to the end of the range, beneath the depth."""
-        import cv2
-
-        out[y : y + 10, x : x + width] = cv2.resize(self._table[128:].transpose(1, 0, 2), (width, 10))
-        end = f"{self.range_mm:g} mm"
-        _write(out, "0", (x, y + 26))
-        _write(out, end, (x + width - 8 * len(end), y + 26))
 
 
 def round_up(range_mm: float, high_mm: float) -> float:
@@ -144,15 +138,6 @@ def _draw_scale(out: Pixels, mm_per_pixel: float, left: int, bottom: int) -> Non
     _write(out, f"{length:g} mm", (x, y - 6), 40)
 
 
-def _outlined(frame: TactileFrame) -> Pixels:
-    """The image (H, W, 3) B, G, R with the outline of the contact."""
-    import cv2
-
-    picture = np.ascontiguousarray((frame.image.flip(0).permute(1, 2, 0) * 255.0 + 0.5).to(torch.uint8).numpy())
-    cv2.drawContours(picture, outlines(frame.output.contact[0, 0].numpy()), -1, (255, 255, 255), 1, cv2.LINE_AA)
-    return picture
-
-
 class Sheet:
     """Keeps depth of frames in contact, and draws six of them, evenly spaced in time, in one range of colours.
 
@@ -180,16 +165,12 @@ class Sheet:
             self._kept, self._every = self._kept[::2], self._every + 1
 
     @property
-    def times(self) -> list[float]:
-        """Times of the frames that are kept, s."""
-        return [time_s for time_s, _, _ in self._kept]
+    def any_contact(self) -> bool:
+        """Whether there is something to draw."""
+        return bool(self._kept)
 
     def figure(self) -> "Figure":
-        """The sheet.
-
-        Raises:
-            ValueError: no frame was in contact.
-        """
+        """The sheet; ValueError where no frame was in contact."""
         if not self._kept:
             raise ValueError("sheet: expected frames with contact, got none: there is nothing to draw")
         from ..viz import sheet_figure

@@ -21,8 +21,6 @@ LOSSLESS = ".mkv"
 class Recorder:
     """Writes the frames of a live source as they come; :func:`open_source` reads them again bit for bit, with their times.
 
-    Frames that come while earlier ones are being written are lost to the stream too; times tell.
-
     Args:
         path: a new name ending in .mkv for FFV1 (8 bits), or a folder without images for PNG (8 or 16 bits).
         fps: frames a second that a video states.
@@ -52,21 +50,19 @@ class Recorder:
     def add(self, pixels: Pixels | Unreadable) -> None:
         """Write a frame that has just come; it waits where too many are being written."""
         with self._lock:
-            if isinstance(pixels, np.ndarray) and not self._closed:
-                self._write(pixels, time.monotonic())
-
-    def _write(self, pixels: Pixels, now: float) -> None:
-        if self._video is None:
-            self._images.submit(write_pixels, self.path / f"{len(self.times):06d}.png", pixels)
-        elif pixels.dtype != np.uint8 or pixels.shape[0] % 2 or pixels.shape[1] % 2:
-            raise ValueError(
-                f"record: expected 8 bits and an even size for {LOSSLESS}, got {pixels.dtype} {pixels.shape[:2]}: name a folder"
-            )
-        else:
-            self._video.write(pixels)
-        if not self.times:
-            self._start, self._clock = now, time.time()
-        self.times.append(now - self._start)
+            if not isinstance(pixels, np.ndarray) or self._closed:
+                return
+            now = time.monotonic()
+            if self._video is None:
+                self._images.submit(write_pixels, self.path / f"{len(self.times):06d}.png", pixels)
+            elif pixels.dtype != np.uint8 or pixels.shape[0] % 2 or pixels.shape[1] % 2:
+                got = f"{pixels.dtype} {pixels.shape[:2]}"
+                raise ValueError(f"record: expected 8 bits and an even size for {LOSSLESS}, got {got}: name a folder")
+            else:
+                self._video.write(pixels)
+            if not self.times:
+                self._start, self._clock = now, time.time()
+            self.times.append(now - self._start)
 
     def close(self) -> None:
         """Finish the recording."""

@@ -1,10 +1,7 @@
 """The way of each frame of a recording: is it usable, depth, what it was seen under. Live streams and data sets share it."""
 
 import math
-from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -19,11 +16,7 @@ from .background import find_background
 
 
 def check_device(device: str) -> torch.device:
-    """The device of that name, if this machine has it.
-
-    Raises:
-        ValueError: no such device here.
-    """
+    """The device of that name; ValueError where this machine has none."""
     try:
         found = torch.device(device)
     except (RuntimeError, TypeError) as error:
@@ -74,7 +67,6 @@ class Recording:
         network: a trained network in place of the calibration's model, see :func:`torchvts.pipeline.unit_pipeline`.
         device: of the pipeline, "cpu" or "cuda"; frames come and go on the CPU.
         contact: thresholds of contact; None for the usual ones.
-        stage: makes a context in which a stage of that name runs, to measure its time.
     Attributes:
         pipe: the pipeline, frozen.
         conditions: what the last frame was seen under; None before the first.
@@ -92,22 +84,20 @@ class Recording:
         network: str | Path | None = None,
         device: str = "cpu",
         contact: ContactSettings | None = None,
-        stage: Callable[[str], AbstractContextManager[Any]] = lambda name: nullcontext(),
     ) -> None:
         check_calibration("calibration", calibration)
         self.device = check_device(device)
         pipe = unit_pipeline(calibration, mode, network, contact).float().requires_grad_(False)
         self.check = FrameCheck.from_calibration(calibration)
-        self._stage = stage
         self.conditions: Conditions | None = None
         self.doubt = ""
-        image = None if first is None else find_background(first)
+        image = None if first is None else find_background(first)[None]
         if first is not None:
             _learn_unrest(pipe, first)
         self._usual_deg = usual_unseen_deg(calibration, pipe)
         self.pipe: FrozenPipeline = pipe.to(self.device).freeze()
         if image is not None:
-            self._start(image[None])
+            self._refuse_contact(image)
 
     def unusable(self, frame: Tensor) -> str:
         """Why a frame (1, 3, H, W), rectified, cannot be used; an empty text where it can."""
@@ -115,16 +105,13 @@ class Recording:
 
     def __call__(self, frame: Tensor) -> DepthOutput:
         """Depth of the next frame, (1, 3, H, W) in [0, 1], rectified, usable."""
-        with torch.inference_mode(), self._stage("depth"):
+        with torch.inference_mode():
             output, conditions = self.pipe.with_conditions(frame.to(self.device))
-            output, self.conditions = (
-                DepthOutput(*(part.cpu() for part in output)),
-                Conditions(*(part.cpu() for part in conditions)),
-            )
+        self.conditions = Conditions(*(part.cpu() for part in conditions))
         self.doubt = doubts_of(self.conditions, self._usual_deg)[0]
-        return output
+        return DepthOutput(*(part.cpu() for part in output))
 
-    def _start(self, image: Tensor) -> None:
+    def _refuse_contact(self, image: Tensor) -> None:
         """Refuse another unit and a contact in the first frames."""
         if reason := self.unusable(image):
             raise ValueError(f"background: the first frames cannot be used: {reason}")

@@ -10,16 +10,10 @@ from typing import NamedTuple, Protocol
 
 from torch import Tensor
 
-from ..core.checks import brief, check_integer, check_least, check_path, check_positive, check_record, parse_number
+from ..core.checks import check_integer, check_least, check_path, check_positive, check_record, parse_number
 from ..core.containers import find_container
 from ..core.files import IMAGE_SUFFIXES, REMEDIES, VIDEO_SUFFIXES, Pixels, rgb_from_bgr
-from ..core.recordings import (
-    RawFrame,
-    cut_short,
-    image_files,
-    raw_frames,
-    video_rate,
-)
+from ..core.recordings import RawFrame, cut_short, image_files, raw_frames, video_rate
 from .cameras import AS_IT_IS, Camera, CameraSettings
 from .devices import find_camera, found_cameras
 
@@ -40,11 +34,7 @@ SETTLING = 5
 
 
 class Unreadable(NamedTuple):
-    """A frame that cannot be read.
-
-    Attributes:
-        reason: why.
-    """
+    """A frame that cannot be read, and why."""
 
     reason: str
 
@@ -84,8 +74,7 @@ class LiveReader:
     """A source that does not wait, read by a thread of its own, because a camera that has hung blocks who reads it.
 
     A frame is read when it is asked for; after :meth:`drop_late` all are, and who comes late finds only the newest. What fails,
-    ends or hangs is opened again for some time, then an error is raised. The first frames after opening are left out, while
-    exposure settles. A recording (``live`` of the reader is False) has all its frames, and an end.
+    ends or hangs is opened again for some time, then an error is raised. A recording (``live`` of the reader is False) has an end.
 
     Args:
         open_reader: opens the source.
@@ -95,7 +84,6 @@ class LiveReader:
         silent_s: a source that gives no frame for this long has stopped.
         started_s: time 0 of its frames, by :func:`time.monotonic`.
         dropped: number of frames that nobody took.
-        reconnections: how often it was opened again.
     Raises:
         OSError: by :meth:`read` and :meth:`take`: the source has stopped.
     """
@@ -228,11 +216,7 @@ def times_file(recording: Path) -> Path:
 
 
 def read_times(recording: Path) -> dict[str, float]:
-    """Times of a recording's frames, s, by name; none where there is no table.
-
-    Raises:
-        ValueError: the table is damaged.
-    """
+    """Times of a recording's frames, s, by name; none where there is no table, ValueError where it is damaged."""
     path = times_file(recording)
     if not path.is_file():
         return {}
@@ -286,18 +270,15 @@ class FileReader:
 def frames(source: str | int | Path) -> Iterator[tuple[str, Tensor]]:
     """The frames of an image, a folder, a TIFF of several pages, a video, a container or a camera: pairs of a name and an image.
 
-    Images are (3, H, W) float32 in [0, 1], R, G, B, as they are: ``sensor.rectify`` cuts them. A camera gives all its frames, until
-    it stops or nobody asks.
+    Images are (3, H, W) float32 in [0, 1], R, G, B, as they are: ``sensor.rectify`` cuts them.
 
     Args:
         source: a path, which goes on inside a container of several recordings (``day.h5/left/rgb``); or a camera by its index,
             name, path or URL, as :func:`open_source` takes it.
     Raises:
-        FileNotFoundError: no such file or folder, and no such camera.
+        OSError: no such file, folder or camera, or it has stopped.
         ImportError: the library of a container is not installed.
-        ValueError: no images in the folder, or several recordings of which none is named; while frames are asked for: a file
-            that cannot be read.
-        OSError: no such camera, or it has stopped.
+        ValueError: no images in the folder, several recordings of which none is named, or, later, a file that cannot be read.
     Example:
         >>> import tempfile, torch, torchvts as vts
         >>> with tempfile.TemporaryDirectory() as folder:
@@ -331,24 +312,21 @@ def open_source(source: str | int | Path, reconnect_s: float = 0.0, settings: Ca
         reconnect_s: for how long a camera that has stopped is tried again before :class:`OSError` is raised.
         settings: what is asked of a camera's driver.
     Raises:
-        FileNotFoundError: no such file or folder.
-        OSError: no such camera.
+        OSError: no such file, folder or camera.
         ValueError: not a video, no images, or settings of what is no camera.
     """
     check_least("reconnect_s", reconnect_s)
     check_record("settings", settings, CameraSettings)
+    if isinstance(source, str) and source.isascii() and source.isdigit():
+        source = int(source)
     if isinstance(source, int) and not isinstance(source, bool):
         index = check_integer("source", source, 0, MOST_CAMERAS)
         return LiveReader(lambda: Camera(index, settings), reconnect_s)
     text = str(check_path("source", source))
-    if text.isascii() and text.isdigit():
-        if len(text) > 9 or int(text) > MOST_CAMERAS:
-            raise ValueError(f"source: expected a camera's index of at most {MOST_CAMERAS}, got {brief(text)}")
-        return LiveReader(lambda: Camera(int(text), settings), reconnect_s)
     path = Path(text)
     if not path.is_dir() and find_camera(text) is not None:
         return LiveReader(lambda: Camera(_index_of(text), settings), reconnect_s)  # found again: it may come back as another
-    if settings.given:
+    if settings != AS_IT_IS:
         raise ValueError(f"settings: size, rate, exposure and white balance are those of a camera of this machine, got {text}")
     if isinstance(source, str) and source.lower().startswith(URLS):
         return LiveReader(lambda: Camera(source), reconnect_s)
@@ -367,11 +345,7 @@ def open_source(source: str | int | Path, reconnect_s: float = 0.0, settings: Ca
 
 
 def _index_of(text: str) -> int:
-    """The index of a camera that a text named before.
-
-    Raises:
-        OSError: it is not there now.
-    """
+    """The index of a camera that a text named before; OSError where it is not there now."""
     index = find_camera(text)
     if index is None:
         raise OSError(f"source: expected a camera {text!r}, got none: unplugged? {found_cameras()}")
@@ -379,17 +353,10 @@ def _index_of(text: str) -> int:
 
 
 def check_reader(source: object) -> Reader:
-    """Return a reader of the user's own, watched if it is live.
-
-    Raises:
-        TypeError: no reader.
-        ValueError: its rate is no number above 0.
-    """
-    if not callable(getattr(source, "read", None)) or not callable(getattr(source, "close", None)):
-        raise TypeError(f"source: expected a path, a camera's index or a Reader, got {type(source).__name__}")
+    """Return a reader of the user's own, watched if it is live; TypeError or ValueError where it is none."""
+    if missing := [name for name in ("read", "close", "name", "live", "fps") if not hasattr(source, name)]:
+        got = f"{type(source).__name__} without {', '.join(missing)}"
+        raise TypeError(f"source: expected a path, a camera's index or a Reader, got {got}")
     reader: Reader = source  # type: ignore[assignment]
-    for name in ("name", "live", "fps"):
-        if not hasattr(reader, name):
-            raise TypeError(f"source: expected a Reader with name, live and fps, got {type(source).__name__} without {name}")
     check_positive("source: fps", reader.fps)
     return LiveReader(lambda: reader) if reader.live else reader

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 
 import numpy as np
 
-STAGES = ("read", "wait", "rectify", "light", "depth", "draw", "view", "write")
+STAGES = ("read", "wait", "rectify", "depth", "motion", "draw", "view", "write")
 """In the order of a frame."""
 
 
@@ -20,7 +20,7 @@ class StageClock:
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Measure the time of the block."""
+        """Measure the time of the block, which is one of :data:`STAGES`."""
         start = time.perf_counter()
         try:
             yield
@@ -32,13 +32,7 @@ class StageClock:
         self._frames.append(self._now)
         self._now = {}
 
-    @property
-    def last(self) -> dict[str, float]:
-        """Stages of the last whole frame, ms."""
-        return self._frames[-1] if self._frames else {}
-
     def median_ms(self) -> dict[str, float]:
         """Median of each stage over the frames in which it ran, in the order of a frame."""
-        names = dict.fromkeys([*STAGES, *(name for frame in self._frames for name in frame)])
-        names = {name: None for name in names if any(name in frame for frame in self._frames)}
-        return {name: float(np.median([frame[name] for frame in self._frames if name in frame])) for name in names}
+        times = {name: [frame[name] for frame in self._frames if name in frame] for name in STAGES}
+        return {name: float(np.median(ms)) for name, ms in times.items() if ms}

@@ -59,7 +59,7 @@ class VideoFile:
         check_text_name("video", self.path)
         self._file: Any = None
         self._writer: Any = None
-        self._temporary, self._size, self._count = self.path, (0, 0), 0
+        self._temporary, self._size, self._count = self.path, tuple[int, ...](), 0
         self._encoder = InTurn()
 
     def __enter__(self) -> "VideoFile":
@@ -69,25 +69,17 @@ class VideoFile:
 
     def write(self, picture: Pixels) -> None:
         """Append a frame, (H, W, 3) B, G, R, 8 bits, which must not be changed any more; all of one size."""
-        if self._writer is None:
-            self._size = picture.shape[:2]
-            self._writer = self._open()
-        if picture.shape[:2] != self._size:
-            raise ValueError(f"video: expected pictures of {self._size} like the first, got {picture.shape[:2]}")
-        self._encoder.submit(self._encode, picture)
-
-    def _encode(self, picture: Pixels) -> None:
-        self._writer.write(picture)
-        self._count += 1
-
-    def _open(self) -> Any:
         import cv2
 
-        code = CODES[self.path.suffix.lower()]
-        writer = cv2.VideoWriter(str(self._temporary), cv2.VideoWriter.fourcc(*code), self.fps, self._size[::-1])
-        if writer.isOpened():
-            return writer
-        raise OSError(f"video: {self.path}: OpenCV cannot write this kind of file here: try .avi")
+        if self._writer is None:
+            self._size, code = picture.shape[:2], cv2.VideoWriter.fourcc(*CODES[self.path.suffix.lower()])
+            self._writer = cv2.VideoWriter(str(self._temporary), code, self.fps, self._size[::-1])
+            if not self._writer.isOpened():
+                raise OSError(f"video: {self.path}: OpenCV cannot write this kind of file here: try .avi")
+        if picture.shape[:2] != self._size:
+            raise ValueError(f"video: expected pictures of {self._size} like the first, got {picture.shape[:2]}")
+        self._encoder.submit(self._writer.write, picture)
+        self._count += 1
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: Any) -> None:
         whole = False

@@ -27,11 +27,7 @@ def has_screen() -> bool:
 
 
 def require_rerun() -> Any:
-    """The package rerun.
-
-    Raises:
-        ImportError: it is not installed; the message says how to.
-    """
+    """The package rerun; ImportError where it is not installed."""
     try:
         import rerun
     except ImportError as error:
@@ -44,14 +40,13 @@ class LiveView:
 
     Entities: ``image`` with ``image/contact``, ``depth`` (mm), ``normals``, ``surface`` (points, mm: x right, y up, z to camera),
     ``curves/area_mm2`` and ``curves/deepest_mm``, on the timelines ``frame`` and ``time``; ``surface/axes``, where poses are added.
-    The surface is drawn higher than it is by the factor in the title of its view; its points are true.
 
     Args:
         mm_per_pixel: pixel pitch, mm.
         metric: whether depth is in mm; otherwise the titles say that it is not.
         save: file to record to, .rrd; None for none.
         viewer: start the viewer, which needs a screen.
-        exaggeration: factor of the height of the surface on the screen.
+        exaggeration: factor of the height of the surface on the screen; its points are true.
     Raises:
         ImportError: rerun is not installed.
         ValueError: a file with another suffix; neither file nor viewer.
@@ -96,11 +91,8 @@ class LiveView:
         rr = self._rr
         self._stream.log("surface", rr.Transform3D(scale=[1.0, 1.0, self.exaggeration]), static=True)
         self._stream.log("surface", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-        for name, label, color in (
-            ("area_mm2", "contact area, mm2", (0, 114, 178)),
-            ("deepest_mm", "deepest point, mm", (213, 94, 0)),
-        ):
-            self._stream.log(f"curves/{name}", rr.SeriesLines(names=label, colors=color), static=True)
+        for name, color in (("area_mm2", (0, 114, 178)), ("deepest_mm", (213, 94, 0))):
+            self._stream.log(f"curves/{name}", rr.SeriesLines(colors=color), static=True)
 
     def add(self, frame: TactileFrame) -> None:
         """Log a frame."""
@@ -125,11 +117,7 @@ class LiveView:
         stream.log("curves/deepest_mm", rr.Scalars(float(depth.max())))
 
     def add_axes(self, ends: Tensor | None) -> None:
-        """Log the axes of an object in the frame added last.
-
-        Args:
-            ends: (4, 3), their origin and the ends of x (red), y (green) and z (blue), mm, x right, y up; None for no pose.
-        """
+        """Log the axes of an object: (4, 3) origin and ends of x (red), y (green), z (blue), mm, y up; None for no pose."""
         rr = self._rr
         if self.recording_to is None and not self._viewer:
             return

@@ -159,7 +159,7 @@ ROS_IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage", "senso
 
 
 def _of_bag(path: Path) -> Films:
-    """A bag of ROS 1, or the folder of a bag of ROS 2."""
+    """A bag of ROS 1, the folder of a bag of ROS 2, or a file of MCAP."""
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
 
@@ -174,27 +174,6 @@ def _of_bag(path: Path) -> Films:
     with opened() as bag:
         topics = [(c.topic, c.msgcount) for c in bag.connections if c.msgtype in ROS_IMAGES]
     return {topic: Film(count, partial(reads, topic)) for topic, count in topics}
-
-
-def _of_mcap(path: Path) -> Films:
-    from mcap.reader import make_reader
-    from mcap_ros2.decoder import DecoderFactory
-
-    def reads(topic: str) -> Iterator[Callable[[], Any]]:
-        with path.open("rb") as stream:
-            for decoded in make_reader(stream, decoder_factories=[DecoderFactory()]).iter_decoded_messages([topic]):
-                yield partial(_of_message, decoded.decoded_message)
-
-    films: dict[str, Film] = {}
-    with path.open("rb") as stream:
-        summary = make_reader(stream).get_summary()
-    if summary is None:
-        return films
-    counts = summary.statistics.channel_message_counts if summary.statistics else {}
-    for channel in summary.channels.values():
-        if channel.schema_id in summary.schemas and summary.schemas[channel.schema_id].name in ROS_IMAGES:
-            films[channel.topic] = Film(counts.get(channel.id, 0), partial(reads, channel.topic))
-    return films
 
 
 ORDERS = {"rgb8": "RGB", "bgr8": "BGR", "rgba8": "RGBA", "bgra8": "BGRA", "rgb16": "RGB", "bgr16": "BGR", "8UC3": "BGR"}
@@ -242,7 +221,7 @@ CONTAINERS = (
     Container("a LeRobot data set", (), ("meta/info.json", "codebase_version"), _of_lerobot),
     Container("a bag of ROS 1", (".bag",), ("", ""), _of_bag),
     Container("a bag of ROS 2", (), ("metadata.yaml", "rosbag2_bagfile_information"), _of_bag),
-    Container("an MCAP file", (".mcap",), ("", ""), _of_mcap),
+    Container("an MCAP file", (".mcap",), ("", ""), _of_bag),
 )
 
 

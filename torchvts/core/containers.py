@@ -248,12 +248,7 @@ EXPECTED = "expected frames (T, H, W, 3) or (T, N, H, W, 3), R, G, B, unsigned i
 
 
 def open_film(path: Path) -> Film | None:
-    """The recording that a path names in a container; None where the path leads into none.
-
-    Raises:
-        ImportError: the library of this container is not installed.
-        ValueError: damaged, without images, or with several recordings of which none is named.
-    """
+    """The recording that a path names in a container, or an error; None where the path leads into none."""
     found = find_container(path)
     if found is None:
         return None

@@ -1,6 +1,5 @@
 """How the sensor's image lies in the frames of its camera: bent by a lens, turned, mirrored, cut by a region, corners or a crop."""
 
-import math
 import warnings
 from functools import lru_cache
 from typing import TYPE_CHECKING, NamedTuple
@@ -78,13 +77,7 @@ def is_raw(name: str, frame: Tensor, view: CameraView) -> bool:
 def rectified(name: str, frame: Tensor, view: CameraView, places: Tensor | None) -> Tensor:
     """Images (B, 3, height, width) of raw frames (B, 3, h, w), sampled once and resized at most once. Scripts.
 
-    Args:
-        name: of the frames in errors.
-        frame: raw frames.
-        view: what is taken of them.
-        places: (1, h, w, 2) from :func:`places_in_frame`.
-    Raises:
-        ValueError: frames that do not contain the place of the gel.
+    ``places``, (1, h, w, 2), are those of :func:`places_in_frame`. Frames that do not contain the place of the gel are refused.
     """
     image = _sampled(frame, places) if view.bent and places is not None else _taken(name, frame, view, places)
     if image.shape[2] != view.size[0] or image.shape[3] != view.size[1]:
@@ -194,11 +187,9 @@ def _misfit(view: CameraView, rows: int, columns: int) -> str:
 def camera_above(sensor: "Sensor") -> tuple[float, float, float] | None:
     """Where the camera of a sensor stands above the middle of the skin, mm: along x and y of the image, and height.
 
-    Four corners of the skin, which is a plane, and their places in frames without distortion give its pose.
+    Four corners of the skin, which is a plane, and their places in frames without distortion give its pose. None without a camera
+    matrix, or where the size of raw frames must be known and is not: of turned or mirrored ones, and without a region or corners.
 
-    Returns:
-        None without a camera matrix, or where the size of raw frames must be known and is not: of turned or mirrored ones, and of
-        those without a region or corners.
     Source:
         Zhang, A flexible new technique for camera calibration, PAMI 22(11), 2000, section 3.1.
     """
@@ -247,12 +238,6 @@ def check_corners(value: object) -> Corners:
             f"bottom left, got {value!r}"
         )
     return corners
-
-
-def sides_of(corners: Corners) -> tuple[float, float]:
-    """Mean length of the sides along x, and along y, pixels."""
-    top, right, bottom, left = (math.dist(corners[k], corners[(k + 1) % 4]) for k in range(4))
-    return 0.5 * (top + bottom), 0.5 * (right + left)
 
 
 def check_raw_sizes(value: object) -> tuple[tuple[int, int], ...]:

@@ -409,9 +409,6 @@ def from_dict(
     """Make a dataclass from the keys and values of a file; errors name ``source``, the file, and the key.
 
     Values that are records themselves are read by ``parts``, each by its key.
-
-    Raises:
-        ValueError: no dict, an unknown or missing key, or a value that the class rejects.
     """
     if not isinstance(values, dict):
         raise ValueError(f"{source}: expected keys and values, got {type(values).__name__}")

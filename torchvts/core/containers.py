@@ -25,15 +25,10 @@ EXTRA = "pip install 'torchvts[containers]'"
 
 
 class Film(NamedTuple):
-    """One recording of a container.
+    """One recording of a container."""
 
-    Attributes:
-        length: number of its frames.
-        reads: goes through them; each is decoded by a call, before the next is asked for.
-    """
-
-    length: int
-    reads: Callable[[], Iterator[Callable[[], Any]]]
+    length: int  # number of its frames
+    reads: Callable[[], Iterator[Callable[[], Any]]]  # goes through them; each is decoded by a call, before the next is asked for
 
 
 Films = Mapping[str, Film]
@@ -196,18 +191,11 @@ def _of_message(message: Any) -> Any:
 
 
 class Container(NamedTuple):
-    """A kind of container.
-
-    Attributes:
-        kind: what it is, in words.
-        suffixes: how the names of its files end.
-        marker: of a folder: the file that tells it, and what this file contains; ("", "") for none.
-        read: finds the recordings in one.
-    """
+    """A kind of container, and how to find the recordings in one."""
 
     kind: str
-    suffixes: tuple[str, ...]
-    marker: tuple[str, str]
+    suffixes: tuple[str, ...]  # of the names of its files
+    marker: tuple[str, str]  # of a folder: the file that tells it, and what this file contains; ("", "") for none
     read: Callable[[Path], Films]
 
 

@@ -113,12 +113,7 @@ def write_atomically(path: str | Path) -> Iterator[Path]:
     """Give a temporary file beside ``path``; it replaces ``path`` when the block ends without an error, and is removed otherwise.
 
     The temporary file keeps the suffix, because some writers look at it. A process that is killed in between leaves the old
-    file as it was and a hidden ``.stem-xxxxxxxx.suffix`` beside it, which nothing reads.
-
-    Raises:
-        FileNotFoundError: the folder is missing.
-        PermissionError: the folder cannot be written.
-        OSError: the disk is full; names the file.
+    file as it was and a hidden ``.stem-xxxxxxxx.suffix`` beside it, which nothing reads. Errors name the file.
     """
     path = check_target(path)
     temporary = path.with_name(f".{path.stem}-{secrets.token_hex(4)}{path.suffix}")
@@ -242,11 +237,7 @@ def decode_image(path: Path, flags: int) -> Pixels | None:
 
 
 def decode_bytes(data: np.ndarray[Any, Any], flags: int, source: str) -> Pixels | None:
-    """:func:`decode_image` for bytes (N,) in memory; ``source`` names them in errors.
-
-    Raises:
-        ValueError: a PNG whose header gives more than :data:`MOST_PIXELS`, as a file of some kilobytes can.
-    """
+    """:func:`decode_image` for bytes in memory; refuses a PNG whose header gives too many pixels, as a small file can."""
     import cv2
 
     height, width = png_size(data[:24].tobytes()) or (0, 0)
@@ -387,12 +378,7 @@ def checksum(tensors: dict[str, Tensor], metadata: dict[str, Any]) -> str:
 
 
 def load_tensors(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Read what :func:`save_tensors` wrote. Nothing is unpickled.
-
-    Raises:
-        FileNotFoundError: no such file.
-        ValueError: not a safetensors file, cut short, damaged, or not written by torchvts.
-    """
+    """Read what :func:`save_tensors` wrote, or raise where it is damaged or another file. Nothing is unpickled."""
     path = check_path("path", path)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file")

@@ -77,12 +77,7 @@ def gradient_from_normal(normal: Tensor, max_slope: float = MAX_SLOPE) -> Tensor
 
 
 def gradient_of_depth(depth_mm: Tensor, mm_per_pixel: float) -> Tensor:
-    """Central differences of depth, (B, 1, H, W) in mm, to (B, 2, H, W), mm per mm; one-sided at the border.
-
-    Example:
-        >>> gradient_of_depth(torch.tensor([[[[0.0, 1.0, 4.0]]]]), 0.5)[0, 0]
-        tensor([[2., 4., 6.]])
-    """
+    """Central differences of depth, (B, 1, H, W) in mm, to (B, 2, H, W), mm per mm; one-sided at the border."""
     z = depth_mm * (0.5 / mm_per_pixel)
     near, far = min(1, z.shape[3] - 1), max(0, z.shape[3] - 2)  # the lines next to the first and the last
     z_x = torch.cat((2.0 * z[..., :1] - z[..., near : near + 1], z, 2.0 * z[..., -1:] - z[..., far : far + 1]), dim=3)

@@ -16,16 +16,10 @@ PAGES = 16
 
 
 class RawFrame(NamedTuple):
-    """A frame of a recording, not decoded yet.
+    """A frame of a recording, not decoded yet; of a video it must be decoded before the next is asked for."""
 
-    Attributes:
-        name: stem of its file; of a video and of a TIFF of several pages with the number of the frame.
-        read: decodes it, (H, W, 3) B, G, R, uint8 or uint16; raises OSError or ValueError. Of a video only before the next is asked
-            for.
-    """
-
-    name: str
-    read: Callable[[], Pixels]
+    name: str  # stem of its file; of a video and of a TIFF of several pages with the number of the frame
+    read: Callable[[], Pixels]  # decodes it, or raises OSError or ValueError
 
 
 def raw_frames(source: str | Path) -> Iterator[RawFrame]:

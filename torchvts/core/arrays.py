@@ -24,12 +24,7 @@ def cell_means(image: Array, cell: int) -> Array:
 
 
 def lower_median(values: Array) -> Array:
-    """Of the last dimension, which is not empty; the lower one of two, as torch has it.
-
-    Example:
-        >>> float(lower_median(np.array([3.0, 1.0, 2.0, 4.0])))
-        2.0
-    """
+    """Of the last dimension, which is not empty; the lower one of two, as torch has it."""
     middle = (values.shape[-1] - 1) // 2
     median: Array = np.partition(values, middle)[..., middle]
     return median

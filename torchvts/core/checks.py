@@ -9,7 +9,7 @@ import math
 import numbers
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -44,18 +44,11 @@ QUANTISATION_STD = 1.0 / 255.0 / math.sqrt(12.0)
 
 
 def check_tensor(name: str, value: object) -> None:
-    """Raise unless ``value`` is a tensor; for an array of NumPy or OpenCV the message says how to convert it.
-
-    Example:
-        >>> import numpy as np
-        >>> check_tensor("depth_mm", np.zeros((4, 4)))
-        Traceback (most recent call last):
-        ...
-        TypeError: depth_mm: expected a torch.Tensor, got ndarray: torch.from_numpy(array) makes one
-    """
+    """Raise unless ``value`` is a tensor; for an array of NumPy or OpenCV the message says how to convert it."""
     if isinstance(value, Tensor):
         if value.layout != torch.strided or value.is_nested or value.is_quantized or value.device.type == "meta":
-            raise TypeError(f"{name}: expected a dense tensor, got {_what_it_is(value)}")
+            kind = "quantised" if value.is_quantized else "nested" if value.is_nested else f"{value.layout} on {value.device}"
+            raise TypeError(f"{name}: expected a dense tensor with values, got one that is {kind}")
         return
     cause = "torch.tensor(...) makes one"
     if isinstance(value, str | os.PathLike):
@@ -71,17 +64,6 @@ def check_tensor(name: str, value: object) -> None:
                 "torchvts.read_image reads a file"
             )
     raise TypeError(f"{name}: expected a torch.Tensor, got {type(value).__name__}: {cause}")
-
-
-def _what_it_is(tensor: Tensor) -> str:
-    """Why a tensor holds no plain values, and what to do."""
-    if tensor.device.type == "meta":
-        return "one on the device meta, which has no values: move it to a CPU or a GPU"
-    if tensor.is_nested:
-        return "a nested one: stack images of one size"
-    if tensor.is_quantized:
-        return f"a quantised one, {tensor.dtype}: use .dequantize()"
-    return f"one of layout {tensor.layout}: use .to_dense()"
 
 
 def check_float_tensor(name: str, value: object) -> None:
@@ -167,14 +149,7 @@ def check_choice(name: str, value: object, choices: Sequence[str]) -> str:
 
 
 def check_batch(name: str, tensor: Tensor, channels: int) -> None:
-    """Raise unless ``tensor`` is a floating-point (B, ``channels``, H, W) batch. Scripts.
-
-    Example:
-        >>> check_batch("gradient", torch.zeros(2, 8, 8), 2)
-        Traceback (most recent call last):
-        ...
-        ValueError: gradient: expected (B, 2, H, W), got [2, 8, 8]: add the batch dimension with [None]
-    """
+    """Raise unless ``tensor`` is a floating-point (B, ``channels``, H, W) batch. Scripts."""
     if not torch.jit.is_scripting():
         check_tensor(name, tensor)
     if tensor.dim() != 4:
@@ -198,12 +173,7 @@ def check_batch(name: str, tensor: Tensor, channels: int) -> None:
 
 
 def check_pitch(name: str, block: object, mm_per_pixel: float) -> None:
-    """Raise where a block has a pitch of its own, and not this one: by another its values would be wrong.
-
-    Example:
-        >>> from torchvts import PoissonDCT
-        >>> check_pitch("integrate", PoissonDCT(0.1), 0.1)
-    """
+    """Raise where a block has a pitch of its own, and not this one: by another its values would be wrong."""
     own = getattr(block, "mm_per_pixel", None)
     if isinstance(own, float) and abs(own / mm_per_pixel - 1.0) > 1e-6:
         kind = type(block).__name__
@@ -306,6 +276,16 @@ def check_shape(name: str, value: object, shape: Sequence[int], like: str = "") 
         raise ValueError(f"{name}: expected {tuple(shape)}{f' like {like}' if like else ''}, got {tuple(value.shape)}")
 
 
+def check_values(name: str, value: object, shape: Sequence[int], bound: str = "") -> None:
+    """Raise unless ``value`` is a float tensor of ``shape``, finite, and "above 0" or "of at least 0" where ``bound`` says so."""
+    check_float_tensor(name, value)
+    check_shape(name, value, shape)
+    assert isinstance(value, Tensor)
+    good = torch.isfinite(value) & (value > 0 if bound == "above 0" else (value >= 0) | (bound == ""))
+    if not bool(good.all()):
+        raise ValueError(f"{name}: expected finite values {bound}".rstrip() + f", got {brief(value.tolist())}")
+
+
 def check_range(name: str, image: Tensor) -> None:
     """Raise unless every value is finite and in [0, 1]. Reads values, which :func:`torch.func.vmap` does not let."""
     if image.numel() == 0:
@@ -329,14 +309,7 @@ def check_range(name: str, image: Tensor) -> None:
 
 
 def parse_number(text: str) -> float:
-    """A decimal number of a text file; Python's own ``float`` also takes "1_0", "nan" and digits of other scripts.
-
-    Raises:
-        ValueError: no number, or an infinite one.
-    Example:
-        >>> parse_number(" -1.5e3 ")
-        -1500.0
-    """
+    """A finite decimal number of a text file; Python's own ``float`` also takes "1_0", "nan" and digits of other scripts."""
     word = text.strip()
     number = float(word) if _NUMBER.fullmatch(word) else math.nan
     if not math.isfinite(number):
@@ -430,15 +403,12 @@ def check_numbers(name: str, value: object, shape: Sequence[int]) -> tuple[float
     return tuple(tensor.flatten().tolist())
 
 
-def from_dict(cls: type[_Record], values: object, source: str) -> _Record:
-    """Make a dataclass from the keys and values of a file; errors name ``source`` and the key.
+def from_dict(
+    cls: type[_Record], values: object, source: str, parts: Mapping[str, Callable[[Any, str], Any]] | None = None
+) -> _Record:
+    """Make a dataclass from the keys and values of a file; errors name ``source``, the file, and the key.
 
-    Args:
-        cls: the dataclass.
-        values: keys and values.
-        source: name of the file, for messages.
-    Raises:
-        ValueError: no dict, an unknown or missing key, or a value that the class rejects.
+    Values that are records themselves are read by ``parts``, each by its key.
     """
     if not isinstance(values, dict):
         raise ValueError(f"{source}: expected keys and values, got {type(values).__name__}")
@@ -450,7 +420,8 @@ def from_dict(cls: type[_Record], values: object, source: str) -> _Record:
     for field in fields:
         if field.default is dataclasses.MISSING and field.name not in values:
             raise ValueError(f"{source}: key {field.name!r}: missing")
+    read = {key: part(values[key], f"{source}: {key}") for key, part in (parts or {}).items() if values.get(key) is not None}
     try:
-        return cls(**values)
+        return cls(**{**values, **read})
     except (TypeError, ValueError) as error:
         raise ValueError(f"{source}: key {error}") from error

@@ -25,15 +25,10 @@ EXTRA = "pip install 'torchvts[containers]'"
 
 
 class Film(NamedTuple):
-    """One recording of a container.
+    """One recording of a container."""
 
-    Attributes:
-        length: number of its frames.
-        reads: goes through them; each is decoded by a call, before the next is asked for.
-    """
-
-    length: int
-    reads: Callable[[], Iterator[Callable[[], Any]]]
+    length: int  # number of its frames
+    reads: Callable[[], Iterator[Callable[[], Any]]]  # goes through them; each is decoded by a call, before the next is asked for
 
 
 Films = Mapping[str, Film]
@@ -159,7 +154,7 @@ ROS_IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage", "senso
 
 
 def _of_bag(path: Path) -> Films:
-    """A bag of ROS 1, or the folder of a bag of ROS 2."""
+    """A bag of ROS 1, the folder of a bag of ROS 2, or a file of MCAP."""
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
 
@@ -174,27 +169,6 @@ def _of_bag(path: Path) -> Films:
     with opened() as bag:
         topics = [(c.topic, c.msgcount) for c in bag.connections if c.msgtype in ROS_IMAGES]
     return {topic: Film(count, partial(reads, topic)) for topic, count in topics}
-
-
-def _of_mcap(path: Path) -> Films:
-    from mcap.reader import make_reader
-    from mcap_ros2.decoder import DecoderFactory
-
-    def reads(topic: str) -> Iterator[Callable[[], Any]]:
-        with path.open("rb") as stream:
-            for decoded in make_reader(stream, decoder_factories=[DecoderFactory()]).iter_decoded_messages([topic]):
-                yield partial(_of_message, decoded.decoded_message)
-
-    films: dict[str, Film] = {}
-    with path.open("rb") as stream:
-        summary = make_reader(stream).get_summary()
-    if summary is None:
-        return films
-    counts = summary.statistics.channel_message_counts if summary.statistics else {}
-    for channel in summary.channels.values():
-        if channel.schema_id in summary.schemas and summary.schemas[channel.schema_id].name in ROS_IMAGES:
-            films[channel.topic] = Film(counts.get(channel.id, 0), partial(reads, channel.topic))
-    return films
 
 
 ORDERS = {"rgb8": "RGB", "bgr8": "BGR", "rgba8": "RGBA", "bgra8": "BGRA", "rgb16": "RGB", "bgr16": "BGR", "8UC3": "BGR"}
@@ -217,18 +191,11 @@ def _of_message(message: Any) -> Any:
 
 
 class Container(NamedTuple):
-    """A kind of container.
-
-    Attributes:
-        kind: what it is, in words.
-        suffixes: how the names of its files end.
-        marker: of a folder: the file that tells it, and what this file contains; ("", "") for none.
-        read: finds the recordings in one.
-    """
+    """A kind of container, and how to find the recordings in one."""
 
     kind: str
-    suffixes: tuple[str, ...]
-    marker: tuple[str, str]
+    suffixes: tuple[str, ...]  # of the names of its files
+    marker: tuple[str, str]  # of a folder: the file that tells it, and what this file contains; ("", "") for none
     read: Callable[[Path], Films]
 
 
@@ -242,7 +209,7 @@ CONTAINERS = (
     Container("a LeRobot data set", (), ("meta/info.json", "codebase_version"), _of_lerobot),
     Container("a bag of ROS 1", (".bag",), ("", ""), _of_bag),
     Container("a bag of ROS 2", (), ("metadata.yaml", "rosbag2_bagfile_information"), _of_bag),
-    Container("an MCAP file", (".mcap",), ("", ""), _of_mcap),
+    Container("an MCAP file", (".mcap",), ("", ""), _of_bag),
 )
 
 
@@ -269,12 +236,7 @@ EXPECTED = "expected frames (T, H, W, 3) or (T, N, H, W, 3), R, G, B, unsigned i
 
 
 def open_film(path: Path) -> Film | None:
-    """The recording that a path names in a container; None where the path leads into none.
-
-    Raises:
-        ImportError: the library of this container is not installed.
-        ValueError: damaged, without images, or with several recordings of which none is named.
-    """
+    """The recording that a path names in a container, or an error; None where the path leads into none."""
     found = find_container(path)
     if found is None:
         return None

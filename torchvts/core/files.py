@@ -56,13 +56,7 @@ def check_size(path: Path, kind: str) -> None:
 
 
 def check_target(path: str | Path) -> Path:
-    """Check that a file can be written there, before the work that leads to it.
-
-    Raises:
-        TypeError: not a path.
-        FileNotFoundError: the folder is missing.
-        IsADirectoryError: the path is a folder.
-    """
+    """Return a path at which a file can be written, or raise: asked before the work that leads to it."""
     path = check_path("path", path)
     if not path.parent.is_dir():
         raise FileNotFoundError(f"{path}: folder {path.parent} does not exist: make it first")
@@ -72,17 +66,7 @@ def check_target(path: str | Path) -> Path:
 
 
 def check_folder(path: str | Path) -> Path:
-    """Return the path of a folder for results, which need not exist, or raise.
-
-    Raises:
-        TypeError: not a path.
-        NotADirectoryError: a file has this name, or that of a folder above it.
-    Example:
-        >>> check_folder(__file__)  # doctest: +ELLIPSIS
-        Traceback (most recent call last):
-        ...
-        NotADirectoryError: ...: expected the name of a folder for the results, got that of a file
-    """
+    """Return the path of a folder for results, which need not exist, or raise where a file has its name, or one above it."""
     path = check_path("path", path)
     taken = next((folder for folder in (path, *path.parents) if folder.exists()), path)
     if taken.exists() and not taken.is_dir():
@@ -91,23 +75,14 @@ def check_folder(path: str | Path) -> Path:
 
 
 def make_folder(path: str | Path) -> Path:
-    """Make a folder for results, with those above it, where it is missing.
-
-    Raises:
-        TypeError, NotADirectoryError: as :func:`check_folder`.
-        OSError: it cannot be made there.
-    """
+    """Make a folder for results, with those above it, where it is missing; raises as :func:`check_folder`."""
     path = check_folder(path)
     path.mkdir(parents=True, exist_ok=True)
     return path
 
 
 def check_text_name(name: str, path: str | Path) -> str:
-    """Return a path as text for OpenCV, which crashes on names that are not UTF-8, or raise.
-
-    Raises:
-        ValueError: the name is not UTF-8.
-    """
+    """Return a path as text for OpenCV, which crashes on names that are not UTF-8, or raise ValueError."""
     text = str(path)
     try:
         text.encode()
@@ -118,11 +93,7 @@ def check_text_name(name: str, path: str | Path) -> str:
 
 @contextmanager
 def naming(path: str | Path) -> Iterator[None]:
-    """Let errors of the block name the file that was to be written, as those of a full disk do not by themselves.
-
-    Raises:
-        OSError: of the block, with the name of the file.
-    """
+    """Let errors of the block name the file that was to be written, as those of a full disk do not by themselves."""
     try:
         yield
     except OSError as error:
@@ -142,12 +113,7 @@ def write_atomically(path: str | Path) -> Iterator[Path]:
     """Give a temporary file beside ``path``; it replaces ``path`` when the block ends without an error, and is removed otherwise.
 
     The temporary file keeps the suffix, because some writers look at it. A process that is killed in between leaves the old
-    file as it was and a hidden ``.stem-xxxxxxxx.suffix`` beside it, which nothing reads.
-
-    Raises:
-        FileNotFoundError: the folder is missing.
-        PermissionError: the folder cannot be written.
-        OSError: the disk is full; names the file.
+    file as it was and a hidden ``.stem-xxxxxxxx.suffix`` beside it, which nothing reads. Errors name the file.
     """
     path = check_target(path)
     temporary = path.with_name(f".{path.stem}-{secrets.token_hex(4)}{path.suffix}")
@@ -168,12 +134,7 @@ def write_atomically(path: str | Path) -> Iterator[Path]:
 
 
 def natural_order(name: str) -> tuple[list[str | Decimal], str]:
-    """Key that sorts names with their numbers as numbers, decimals of times too.
-
-    Example:
-        >>> sorted(["10.png", "2.png", "1.25.png", "1.5.png"], key=natural_order)
-        ['1.25.png', '1.5.png', '2.png', '10.png']
-    """
+    """Key that sorts names with their numbers as numbers, decimals of times too: 1.25, 1.5, 2, 10."""
     parts = re.split(r"([0-9]+(?:\.[0-9]+)?)", name)
     return [Decimal(part) if k % 2 else part for k, part in enumerate(parts)], name
 
@@ -237,11 +198,7 @@ def count_pages(path: Path) -> int:
 
 
 def check_colour(pixels: Pixels | None, path: Path) -> Pixels:
-    """The colours of a decoded image (H, W, 3 or 4), B, G, R.
-
-    Raises:
-        ValueError: it could not be decoded, has other channels, or its values are not what :func:`whole_levels` takes.
-    """
+    """The colours of a decoded image (H, W, 3 or 4), B, G, R; raises also where :func:`whole_levels` does."""
     if pixels is None:
         raise ValueError(f"{path}: not an image, or cut short")
     if pixels.ndim != 3 or pixels.shape[2] not in (3, 4):
@@ -252,8 +209,7 @@ def check_colour(pixels: Pixels | None, path: Path) -> Pixels:
 def whole_levels(pixels: np.ndarray[Any, Any], path: Path) -> Pixels:
     """The values of an image in 8 or 16 bits; floats in [0, 1] or [0, 255] become 8 bits where these are exact, else 16.
 
-    Raises:
-        ValueError: other values; or 16 bits so dark that only 8, 10 or 12 of them seem used, whose scale cannot be known.
+    Of 16 bits so dark that only 8, 10 or 12 of them seem used the scale cannot be known.
     """
     most = int(pixels.max(initial=0)) if pixels.dtype == np.uint16 else MOST_OF_12_BITS + 1
     if most <= MOST_OF_12_BITS:
@@ -274,19 +230,14 @@ def whole_levels(pixels: np.ndarray[Any, Any], path: Path) -> Pixels:
 
 
 def decode_image(path: Path, flags: int) -> Pixels | None:
-    """An image file as OpenCV decodes it; None if it does not.
-
-    Raises:
-        ValueError: larger than :data:`MOST_BYTES`, or a PNG whose header gives more than :data:`MOST_PIXELS`, as a
-            file of some kilobytes can.
-    """
+    """An image file as OpenCV decodes it; None if it does not. Raises where it is larger than :data:`MOST_BYTES`."""
     check_size(path, "an image")
     data = np.fromfile(path, dtype=np.uint8)
     return decode_bytes(data, flags, str(path)) if len(data) else None
 
 
 def decode_bytes(data: np.ndarray[Any, Any], flags: int, source: str) -> Pixels | None:
-    """:func:`decode_image` for bytes (N,) in memory; ``source`` names them in errors."""
+    """:func:`decode_image` for bytes in memory; refuses a PNG whose header gives too many pixels, as a small file can."""
     import cv2
 
     height, width = png_size(data[:24].tobytes()) or (0, 0)
@@ -307,12 +258,7 @@ def png_size(head: bytes) -> tuple[int, int] | None:
 
 
 def check_pixels(name: str, pixels: object) -> None:
-    """Raise unless ``pixels`` is an array (H, W, 3) of 8 or 16 bits, unsigned: only then is its largest value known.
-
-    Raises:
-        TypeError: no array, or of another type.
-        ValueError: of another shape.
-    """
+    """Raise unless ``pixels`` is an array (H, W, 3) of 8 or 16 bits, unsigned: only then is its largest value known."""
     if not isinstance(pixels, np.ndarray) or pixels.dtype.kind != "u" or pixels.dtype.itemsize > 2:
         kind = f"an array of {pixels.dtype}" if isinstance(pixels, np.ndarray) else type(pixels).__name__
         raise TypeError(f"{name}: expected an array of uint8 or uint16, got {kind}: pixels.astype(np.uint8) of values 0 to 255")
@@ -322,11 +268,7 @@ def check_pixels(name: str, pixels: object) -> None:
 
 
 def rgb_from_bgr(pixels: Pixels) -> Tensor:
-    """OpenCV's (H, W, 3) B, G, R integers of 8 or 16 bits as (3, H, W) float32 in [0, 1], R, G, B.
-
-    Raises:
-        TypeError, ValueError: another type or shape.
-    """
+    """OpenCV's (H, W, 3) B, G, R integers of 8 or 16 bits as (3, H, W) float32 in [0, 1], R, G, B."""
     check_pixels("pixels", pixels)
     scale, planes = np.float32(np.iinfo(pixels.dtype).max), pixels[:, :, ::-1].transpose(2, 0, 1)
     return torch.from_numpy(np.divide(planes, scale, out=np.empty(planes.shape, np.float32), dtype=np.float32))
@@ -338,9 +280,14 @@ def write_image(path: str | Path, image: Tensor) -> None:
     Raises:
         ValueError: another shape, or a suffix that is no image's.
     """
+    write_pixels(check_path("path", path), bgr_from_rgb(image))
+
+
+def bgr_from_rgb(image: Tensor) -> Pixels:
+    """(3, H, W) R, G, B in [0, 1] as OpenCV's (H, W, 3) B, G, R in 8 bits."""
     check_field("image", image)
     levels = torch.round(image.detach().clamp(0, 1) * 255).to(torch.uint8).cpu()
-    write_pixels(check_path("path", path), np.ascontiguousarray(levels.flip(0).permute(1, 2, 0).numpy()))
+    return np.ascontiguousarray(levels.flip(0).permute(1, 2, 0).numpy())
 
 
 def image_to_bytes(image: Tensor) -> Tensor:
@@ -357,11 +304,7 @@ def image_to_bytes(image: Tensor) -> Tensor:
 
 
 def image_from_bytes(data: Tensor, size: tuple[int, int], source: str) -> Tensor:
-    """Read what :func:`image_to_bytes` gave, (3, H, W) float64.
-
-    Raises:
-        ValueError: not a PNG, or of another size than ``size``; the header is compared with it before decoding.
-    """
+    """Read what :func:`image_to_bytes` gave, (3, H, W) float64, or raise; the size is compared with the header before decoding."""
     import cv2
 
     raw = data.numpy() if data.dtype == torch.uint8 and data.dim() == 1 else np.zeros(0, np.uint8)
@@ -381,11 +324,7 @@ DEPTH_PNG_ZERO = 32768
 
 
 def write_depth_png(path: str | Path, depth_mm: Tensor) -> None:
-    """Write depth as a 16-bit PNG: value = 32768 + depth / 0.0001 mm, so from -3.2768 to 3.2767 mm.
-
-    Raises:
-        ValueError: not one frame, or depth outside that range (write .npy instead).
-    """
+    """Write depth of one frame as a 16-bit PNG: value = 32768 + depth / 0.0001 mm, so from -3.2768 to 3.2767 mm, or raise."""
     frame = depth_mm.detach().cpu().double().reshape(depth_mm.shape[-2], depth_mm.shape[-1])
     value = torch.round(frame / DEPTH_PNG_STEP_MM) + DEPTH_PNG_ZERO
     if not bool(torch.isfinite(frame).all()) or float(value.min()) < 0 or float(value.max()) > 65535:
@@ -439,41 +378,24 @@ def checksum(tensors: dict[str, Tensor], metadata: dict[str, Any]) -> str:
 
 
 def load_tensors(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Read what :func:`save_tensors` wrote. Nothing is unpickled.
-
-    Raises:
-        FileNotFoundError: no such file.
-        ValueError: not a safetensors file, cut short, damaged, or not written by torchvts.
-    """
+    """Read what :func:`save_tensors` wrote, or raise where it is damaged or another file. Nothing is unpickled."""
     path = check_path("path", path)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file")
     check_size(path, "a safetensors file of torchvts")
+    content = path.read_bytes()  # read here: safetensors opens no names that are not UTF-8
     try:
-        content = path.read_bytes()  # read here: safetensors opens no names that are not UTF-8
         tensors = safetensors.torch.load(content)
         (length,) = struct.unpack("<Q", content[:8])
         metadata = json.loads(content[8 : 8 + length]).get("__metadata__") or {}
-    except (
-        safetensors.SafetensorError,
-        struct.error,
-        ValueError,
-        TypeError,
-        KeyError,
-        AttributeError,
-        RuntimeError,
-        MemoryError,
-        RecursionError,
-    ) as error:
+    except Exception as error:  # a damaged file may fail anywhere in the readers of safetensors and JSON
         raise ValueError(f"{path}: not a safetensors file, or cut short: {error}") from error
     if "torchvts" not in metadata:
         raise ValueError(f"{path}: a safetensors file, but not one written by torchvts")
     try:
-        described = json.loads(metadata["torchvts"])
-    except (ValueError, RecursionError) as error:
+        described = dict(json.loads(metadata["torchvts"]))
+    except (TypeError, ValueError, RecursionError) as error:
         raise ValueError(f"{path}: its metadata is damaged: {error}") from error
-    if not isinstance(described, dict):
-        raise ValueError(f"{path}: its metadata is damaged: expected an object")
     given = described.pop("checksum", None)
     if given is None:
         raise ValueError(f"{path}: it has no checksum: written by another torchvts; make it again")

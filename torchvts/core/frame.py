@@ -6,12 +6,7 @@ from torch import Tensor
 
 
 class Frame(NamedTuple):
-    """A batch of compensated images.
-
-    Attributes:
-        image: (B, 3, H, W), compensated.
-        weight: (B, 1, H, W) in [0, 1], how surely the skin has moved.
-    """
+    """Compensated images (B, 3, H, W), and the weight (B, 1, H, W) in [0, 1], how surely the skin has moved."""
 
     image: Tensor
     weight: Tensor

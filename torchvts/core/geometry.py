@@ -17,12 +17,7 @@ CLIFF_SLOPE = 2.0
 def pixel_grid_mm(
     height: int, width: int, mm_per_pixel: float, dtype: torch.dtype = torch.float32, device: torch.device | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Millimetre positions of the pixel centres: x (1, W) to the right, y (H, 1) down, zero at the image centre.
-
-    Example:
-        >>> pixel_grid_mm(3, 3, 0.5)[0]
-        tensor([[-0.5000,  0.0000,  0.5000]])
-    """
+    """Millimetre positions of the pixel centres: x (1, W) to the right, y (H, 1) down, zero at the image centre."""
     x = (torch.arange(width, dtype=dtype, device=device) - (width - 1) / 2.0) * mm_per_pixel
     y = (torch.arange(height, dtype=dtype, device=device) - (height - 1) / 2.0) * mm_per_pixel
     return x[None, :], y[:, None]
@@ -32,10 +27,6 @@ def lengths(vectors: Tensor, dim: int, keepdim: bool = False) -> Tensor:
     """Lengths of vectors along a dimension, as ``vectors.norm(dim=dim)``.
 
     On a CPU that takes thirty times as long (PyTorch 2.13) where the dimension is not the last, as in images.
-
-    Example:
-        >>> lengths(torch.tensor([[3.0, 0.0], [4.0, 0.0]]), dim=0)
-        tensor([5., 0.])
     """
     squared = vectors.square().sum(dim, keepdim)
     some = squared > 0  # else the derivative at zero would be NaN
@@ -48,14 +39,8 @@ def angles_deg(one: Tensor, other: Tensor) -> Tensor:
 
 
 def normal_from_gradient(gradient: Tensor) -> Tensor:
-    """Unit normals that face the camera: (-dz/dx, -dz/dy, 1) / norm.
+    """Unit normals (B, 3, H, W) that face the camera, of gradients (B, 2, H, W), mm per mm: (-dz/dx, -dz/dy, 1) / norm.
 
-    Args:
-        gradient: (B, 2, H, W), (dz/dx, dz/dy), mm per mm.
-    Returns:
-        (B, 3, H, W), n_z > 0.
-    Raises:
-        ValueError: wrong shape. TypeError: not floating point.
     Example:
         >>> normal_from_gradient(torch.zeros(1, 2, 1, 1)).flatten() + 0.0
         tensor([0., 0., 1.])
@@ -77,8 +62,6 @@ def gradient_from_normal(normal: Tensor, max_slope: float = MAX_SLOPE) -> Tensor
         max_slope: largest steepness hypot(p, q), mm per mm.
     Returns:
         (B, 2, H, W), (dz/dx, dz/dy), mm per mm.
-    Raises:
-        ValueError: wrong shape. TypeError: not floating point.
     Source:
         eq. 5 of the paper.
     Example:
@@ -94,12 +77,7 @@ def gradient_from_normal(normal: Tensor, max_slope: float = MAX_SLOPE) -> Tensor
 
 
 def gradient_of_depth(depth_mm: Tensor, mm_per_pixel: float) -> Tensor:
-    """Central differences of depth, (B, 1, H, W) in mm, to (B, 2, H, W), mm per mm; one-sided at the border.
-
-    Example:
-        >>> gradient_of_depth(torch.tensor([[[[0.0, 1.0, 4.0]]]]), 0.5)[0, 0]
-        tensor([[2., 4., 6.]])
-    """
+    """Central differences of depth, (B, 1, H, W) in mm, to (B, 2, H, W), mm per mm; one-sided at the border."""
     z = depth_mm * (0.5 / mm_per_pixel)
     near, far = min(1, z.shape[3] - 1), max(0, z.shape[3] - 2)  # the lines next to the first and the last
     z_x = torch.cat((2.0 * z[..., :1] - z[..., near : near + 1], z, 2.0 * z[..., -1:] - z[..., far : far + 1]), dim=3)
@@ -112,13 +90,7 @@ def slope_of_depth(depth_mm: Tensor, mm_per_pixel: float) -> Tensor:
     """Central differences of depth that do not reach across a cliff.
 
     Where the differences to the two neighbours differ by more than :data:`CLIFF_SLOPE`, the smaller one counts. At the image's
-    border the outer difference is zero.
-
-    Args:
-        depth_mm: (B, 1, H, W), mm.
-        mm_per_pixel: pixel pitch, mm.
-    Returns:
-        (B, 2, H, W), mm per mm.
+    border the outer difference is zero. (B, 1, H, W), mm, to (B, 2, H, W), mm per mm.
     """
     padded = nn.functional.pad(depth_mm, [1, 1, 1, 1], mode="replicate") / mm_per_pixel
     along_x, along_y = padded[..., 1:-1, 1:] - padded[..., 1:-1, :-1], padded[..., 1:, 1:-1] - padded[..., :-1, 1:-1]
@@ -183,11 +155,7 @@ def depth_to_points(depth_mm: Tensor, mm_per_pixel: float, contact: Tensor | Non
 
 
 def check_rigid(name: str, T: Tensor) -> Tensor:
-    """Return ``T`` as (4, 4) float64.
-
-    Raises:
-        ValueError: no rigid motion.
-    """
+    """Return ``T`` as (4, 4) float64, or raise if it is no rigid motion."""
     check_float_tensor(name, T)
     check_shape(name, T, (4, 4))
     T = T.detach().cpu().double()

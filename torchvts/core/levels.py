@@ -23,12 +23,7 @@ DARKEST = 0.02
 
 
 def bits_of(most: float) -> str:
-    """What an image whose largest value is this was perhaps read as; "" where it has all of its range.
-
-    Example:
-        >>> bits_of(4095 / 65535), bits_of(1.0)
-        ('its largest value is 4095 of 65535: 12 bits stored in 16? or no light', '')
-    """
+    """What an image whose largest value is this was perhaps read as, such as 12 bits in 16; "" where it has all of its range."""
     level = round(65535 * most)
     bits = next((bits for bits in (10, 12) if 0 < level < 2**bits), 0)
     return f"its largest value is {level} of 65535: {bits} bits stored in 16? or no light" if bits and most > 0.5 * BLACK else ""

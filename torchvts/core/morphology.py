@@ -10,11 +10,6 @@ def reconstruct(seed: Tensor, mask: Tensor) -> Tensor:
     Rows and columns in turn until nothing is gained: a run of ``mask`` along a line is reached as soon as one of its pixels is, so
     blobs take a few rounds where a 3 x 3 dilation takes as many as the longest path has pixels.
 
-    Args:
-        seed: bool (B, 1, H, W).
-        mask: bool (B, 1, H, W).
-    Returns:
-        bool (B, 1, H, W).
     Source:
         Vincent, Morphological grayscale reconstruction, IEEE Trans. Image Processing 2(2), 1993.
     Example:

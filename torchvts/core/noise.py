@@ -9,16 +9,12 @@ from .precision import widened
 
 
 def noise_std(image: Tensor) -> Tensor:
-    """Noise of each channel, from second differences along rows: what is smooth, contact too, hardly enters.
+    """Noise of each channel (B, C) of (B, C, H, W), from second differences along rows: what is smooth, contact too, hardly enters.
 
     The absolute second differences over an even choice of at most 8,000 pixels: their median, scaled to the standard
     deviation of Gaussian noise, and from there their mean square up to three standard deviations, because a median of 8-bit
     values moves in steps as large as the noise itself. The standard error is 1.3 % of it. Scripts.
 
-    Args:
-        image: (B, C, H, W), W at least 3.
-    Returns:
-        (B, C).
     Source:
         Immerkaer, Fast noise variance estimation, CVIU 64(2), 1996, with the median in place of the mean.
     Example:
@@ -46,9 +42,6 @@ def dark_below(flat: Tensor, three_noises: Tensor) -> Tensor:
     So a dark channel is always nearer to an unlit one than to the flat skin. Minus infinity, never, where the flat skin itself is
     no brighter than three times the noise.
 
-    Args:
-        flat: (..., H, W), what the lights give on the flat skin.
-        three_noises: three standard deviations of the noise, broadcast against it.
     Example:
         >>> import torch
         >>> dark_below(torch.tensor([0.02, 0.04, 0.5]), torch.tensor(0.03))

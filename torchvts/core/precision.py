@@ -5,12 +5,7 @@ from torch import Tensor
 
 
 def widened(values: Tensor) -> Tensor:
-    """Values in float64, or complex128; as they are on Apple's GPUs, which have none. Scripts.
-
-    Example:
-        >>> widened(torch.ones(2)).dtype
-        torch.float64
-    """
+    """Values in float64, or complex128; as they are on Apple's GPUs, which have none. Scripts."""
     if values.device.type == "mps":
         return values
     return values.to(torch.complex128) if values.is_complex() else values.double()

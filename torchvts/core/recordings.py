@@ -8,16 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from .containers import find_container, open_film
-from .files import (
-    IMAGE_SUFFIXES,
-    IN_COLOUR,
-    VIDEO_SUFFIXES,
-    Pixels,
-    check_colour,
-    count_pages,
-    natural_order,
-    read_pixels,
-)
+from .files import IMAGE_SUFFIXES, IN_COLOUR, VIDEO_SUFFIXES, Pixels, check_colour, count_pages, natural_order, read_pixels
 from .videos import ASSUMED_FPS, frames_a_second, open_video, video_reads
 
 PAGES = 16
@@ -25,25 +16,16 @@ PAGES = 16
 
 
 class RawFrame(NamedTuple):
-    """A frame of a recording, not decoded yet.
+    """A frame of a recording, not decoded yet; of a video it must be decoded before the next is asked for."""
 
-    Attributes:
-        name: stem of its file; of a video and of a TIFF of several pages with the number of the frame.
-        read: decodes it, (H, W, 3) B, G, R, uint8 or uint16; raises OSError or ValueError. Of a video only before the next is asked
-            for.
-    """
-
-    name: str
-    read: Callable[[], Pixels]
+    name: str  # stem of its file; of a video and of a TIFF of several pages with the number of the frame
+    read: Callable[[], Pixels]  # decodes it, or raises OSError or ValueError
 
 
 def raw_frames(source: str | Path) -> Iterator[RawFrame]:
     """The frames of an image, a TIFF of several pages, a folder of images (1, 2, 10), a video or a container, in order.
 
-    Raises:
-        FileNotFoundError: no such file or folder.
-        ImportError: the library of a container is not installed.
-        ValueError: a folder without images; while frames are asked for: a video that gives none.
+    What can be seen without decoding is refused at once; a video that gives no frame only while frames are asked for.
     """
     path = Path(source)
     if (film := open_film(path)) is not None:

@@ -10,11 +10,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from .arrays import Array
 from .checks import check_path, in_one_line
 from .files import write_atomically
 from .frame import DepthOutput
-
-Array = np.ndarray[Any, Any]
 
 UNITS = {
     "depth_mm": "mm above the undeformed skin, towards the camera: positive where an object presses",
@@ -82,15 +81,7 @@ class Result(NamedTuple):
 
 
 class Facts(NamedTuple):
-    """What a result file says beside the maps of a frame.
-
-    Attributes:
-        mm_per_pixel: pitch, mm.
-        calibration: file name of the calibration.
-        sensor: name of the sensor.
-        metric: whether lengths are in mm.
-        doubts: of the calibration, a sentence each.
-    """
+    """What a result file says beside the maps of a frame, as in a :class:`Result`."""
 
     mm_per_pixel: float
     calibration: str
@@ -106,7 +97,7 @@ def write_result(path: str | Path, output: DepthOutput, facts: Facts, frame: str
         path: the file, ending in .npz.
         output: of the pipeline, of one frame.
         facts: of the unit that it is from.
-        frame: name of the frame.
+        frame: its name.
         doubt: why less may have been seen in it than is there; "" for nothing.
         compressed: False for what is joined with others, and compressed then.
     """
@@ -121,12 +112,7 @@ def write_result(path: str | Path, output: DepthOutput, facts: Facts, frame: str
 
 
 def join_results(path: str | Path, parts: Sequence[Path]) -> None:
-    """Write the frames of a video as one npz whose arrays have the frames first; one frame is in memory at a time.
-
-    Args:
-        path: the file, ending in .npz.
-        parts: files of :func:`write_result`, in order.
-    """
+    """Join files of :func:`write_result`, in order, into one npz whose arrays have the frames first; one frame is in memory."""
     with write_atomically(path) as temporary, _archive(temporary) as archive:
         with np.load(parts[0]) as first:
             shared = {name: first[name] for name in (*Facts._fields, "units", "format")}

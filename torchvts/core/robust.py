@@ -7,12 +7,8 @@ TUKEY = 4.685
 
 
 def tukey_weight(ratio: Tensor) -> Tensor:
-    """Tukey's biweight, (1 - ratio^2)^2 inside of 1 and 0 outside.
+    """Tukey's biweight of residual / width, (1 - ratio^2)^2 inside of 1 and 0 outside; the width is usually TUKEY deviations.
 
-    Args:
-        ratio: residual / width, of any shape; the width is usually :data:`TUKEY` times the scale of the residuals.
-    Returns:
-        Weights in [0, 1], of the same shape.
     Source:
         Beaton and Tukey, Technometrics 16, 1974.
     Example:

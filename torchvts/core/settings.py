@@ -8,13 +8,7 @@ from torch import Tensor, nn
 
 
 def settings(module: nn.Module) -> dict[str, float]:
-    """Numbers, and those in sequences, that a tree of modules holds as plain attributes, by name such as "compensate.gamma".
-
-    Example:
-        >>> from torchvts import PoissonDCT
-        >>> settings(PoissonDCT(0.1))["mm_per_pixel"]
-        0.1
-    """
+    """Numbers, and those in sequences, that a tree of modules holds as plain attributes, by name such as "compensate.gamma"."""
     found: dict[str, float] = {}
     for place, part in module.named_modules():
         for name, value in vars(part).items():
@@ -30,11 +24,7 @@ def settings_as_tensor(module: nn.Module) -> Tensor:
 
 
 def check_settings(module: nn.Module, state: Tensor) -> None:
-    """Raise unless the settings of a state, by :func:`settings_as_tensor`, are those of the module, up to rounding.
-
-    Raises:
-        ValueError: names settings that differ.
-    """
+    """Raise unless the settings of a state, by :func:`settings_as_tensor`, are those of the module, up to rounding."""
     given, here = json.loads(bytes(state.tolist())), settings(module)
     both = sorted(given.keys() | here.keys())
     differ = [name for name in both if not math.isclose(given.get(name, math.nan), here.get(name, math.nan), rel_tol=1e-5)]

@@ -30,11 +30,7 @@ class _StrictLoader(yaml.SafeLoader):
 
 
 def read_yaml(path: Path) -> Any:
-    """The content of a YAML file, read safely.
-
-    Raises:
-        ValueError: too large, or not YAML.
-    """
+    """The content of a YAML file, read safely, or ValueError."""
     if path.stat().st_size > MOST_YAML_BYTES:
         raise ValueError(
             f"{path}: expected a file of at most {MOST_YAML_BYTES} bytes, got {path.stat().st_size}: not a sensor file"

@@ -9,13 +9,6 @@ def number(value: float | None, digits: int) -> str:
 
 
 def markdown(titles: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
-    """A Markdown table of texts.
-
-    Example:
-        >>> print(markdown(["method", "ms"], [["fast", "2.0"]]))
-        | method | ms |
-        |---|---|
-        | fast | 2.0 |
-    """
+    """A Markdown table of texts."""
     head = ["| " + " | ".join(titles) + " |", "|" + "---|" * len(titles)]
     return "\n".join(head + ["| " + " | ".join(cells) + " |" for cells in lines])

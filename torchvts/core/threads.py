@@ -14,15 +14,6 @@ def one_thread(pixels: int) -> Iterator[None]:
     """Within it, torch's operators run in the calling thread, if the image that is worked on is no larger than usual.
 
     The number of threads is each thread's own. One that torch sees for the first time within starts with one.
-
-    Args:
-        pixels: of the image.
-    Example:
-        >>> before = torch.get_num_threads()
-        >>> with one_thread(320 * 240):
-        ...     inside = torch.get_num_threads()
-        >>> inside, torch.get_num_threads() == before
-        (1, True)
     """
     before = torch.get_num_threads()
     if pixels <= MOST_PIXELS:

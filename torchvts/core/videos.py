@@ -11,22 +11,14 @@ ASSUMED_FPS = 30.0
 
 
 def open_video(path: Path) -> Any:
-    """OpenCV's capture of a video file, which may not be opened.
-
-    Raises:
-        ValueError: the name is not UTF-8.
-    """
+    """OpenCV's capture of a video file, which may not be opened."""
     import cv2
 
     return cv2.VideoCapture(check_text_name("video", path))
 
 
 def video_reads(path: Path) -> Iterator[Callable[[], Pixels]]:
-    """Go through the frames of a video; each is decoded by a call, before the next is asked for.
-
-    Raises:
-        ValueError: it gives none, its name is not UTF-8, or in the call: the frame cannot be decoded.
-    """
+    """Go through the frames of a video, of which there must be one; each is decoded by a call, before the next is asked for."""
     capture, number = open_video(path), 0
 
     def read() -> Pixels:

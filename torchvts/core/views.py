@@ -45,11 +45,13 @@ class OtherView(NamedTuple):
     """How an image shows the skin otherwise than a background.
 
     Attributes:
+        name: "swapped", "turned", "shows_more" or "shows_less".
         what: such as "is turned by 180 degrees".
         undone: median difference from the background with that undone, logarithm of the image value.
         same: without.
     """
 
+    name: str
     what: str
     undone: float
     same: float
@@ -57,14 +59,7 @@ class OtherView(NamedTuple):
     @property
     def cropped(self) -> bool:
         """Whether the image shows more or less of the skin."""
-        return "cropped" in self.what
-
-    @property
-    def name(self) -> str:
-        """One word: "swapped", "turned", "shows_more" or "shows_less"."""
-        if self.cropped:
-            return "shows_more" if "shows more" in self.what else "shows_less"
-        return "swapped" if "swapped" in self.what else "turned"
+        return self.name.startswith("shows")
 
     def in_words(self) -> str:
         """Such as "is turned by 180 degrees (2% off the background with that undone, 31% as it is)"."""
@@ -93,12 +88,12 @@ class Views:
         self._cell = max(1, min(background.shape[1:]) // 24)
         self.background = self.cells(background)
         self._own = own = _log(self.background)
-        self._views: list[tuple[str, Change, Array, Array]] = []
-        for what, change, other in _VIEWS:
+        self._views: list[tuple[str, str, Change, Array, Array]] = []
+        for name, what, change, other in _VIEWS:
             wanted = other(own)
             deciding = _differences(change(own), wanted) >= NEAR
             if float(deciding.mean()) >= LEAST_DECIDING:
-                self._views.append((what, change, wanted, deciding))
+                self._views.append((name, what, change, wanted, deciding))
 
     def cells(self, image: Array) -> Array:
         """(3, h, w) means of an image (3, H, W) over cells, which lie in its middle: a turned image has the same."""
@@ -121,11 +116,11 @@ class Views:
         if _median(as_it_is) <= SAME_VIEW:
             return None
         found = []
-        for what, change, wanted, deciding in self._views:
+        for name, what, change, wanted, deciding in self._views:
             left = _differences(change(seen), wanted)
             if _median(left) < NEAR:  # most views end here
                 undone, same = _median(left[deciding]), _median(as_it_is[deciding])
-                view = OtherView(what, undone, same)
+                view = OtherView(name, what, undone, same)
                 if undone >= min(NEAR, BETTER * same):
                     continue
                 if not view.cropped or self._recoloured(seen, deciding) > min(undone, RECOLOURED):
@@ -165,13 +160,13 @@ def _middle(share: float) -> Change:
     return middle
 
 
-def _known_views() -> list[tuple[str, Change, Change]]:
+def _known_views() -> list[tuple[str, str, Change, Change]]:
     """What may have happened to an image; what is done to its cells, and to the background's, so that they can be compared."""
-    views: list[tuple[str, Change, Change]] = []
+    views: list[tuple[str, str, Change, Change]] = []
     for share in CROPS:
         by, middle = f"than the background, by {share:.0%} of each side", _middle(share)
-        views.append((f"is cropped otherwise and shows more {by}", middle, _same))
-        views.append((f"is cropped otherwise and shows less {by}", _same, middle))
+        views.append(("shows_more", f"is cropped otherwise and shows more {by}", middle, _same))
+        views.append(("shows_less", f"is cropped otherwise and shows less {by}", _same, middle))
     turns = (
         ("", 1, 1),
         ("is turned by 180 degrees", -1, -1),
@@ -182,8 +177,9 @@ def _known_views() -> list[tuple[str, Change, Change]]:
         swapped = "has its channels swapped to the order " + ", ".join("RGB"[c] for c in order) if order != (0, 1, 2) else ""
         what = " and ".join(filter(None, (turned, swapped)))
         back = [order.index(c) for c in range(3)]
+        name = "swapped" if swapped else "turned"
         if what:
-            views.append((what, lambda cells, b=back, d=down, a=across: cells[b, ::d, ::a], _same))  # type: ignore[misc]
+            views.append((name, what, lambda cells, b=back, d=down, a=across: cells[b, ::d, ::a], _same))  # type: ignore[misc]
     return views
 
 

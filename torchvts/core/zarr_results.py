@@ -22,24 +22,8 @@ EMPTY = {"f": "NaN", "b": False}
 def join_as_zarr(path: str | Path, parts: Mapping[int, Path], count: int, left_out: Mapping[str, str]) -> None:
     """Write the frames of a recording as one zipped zarr store, whose row k is frame k; one frame is in memory at a time.
 
-    Args:
-        path: the file, ending in .zip.
-        parts: by row, the files of :func:`torchvts.core.results.write_result`, one or more.
-        count: number of rows; those of no part hold NaN, and False in masks.
-        left_out: by row, as a text, why a frame has no result.
-    Example:
-        >>> import tempfile
-        >>> import torch
-        >>> from .frame import DepthOutput
-        >>> from .results import write_result
-        >>> flat, mask = torch.zeros(1, 1, 4, 6), torch.zeros(1, 1, 4, 6, dtype=torch.bool)
-        >>> output = DepthOutput(flat, flat.expand(1, 2, 4, 6), torch.ones(1, 3, 4, 6), mask, mask)
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     part = Path(folder, "1.npz")
-        ...     write_result(part, output, Facts(0.05, "unit.safetensors", "rig"), "1.png")
-        ...     join_as_zarr(f"{folder}/film.zarr.zip", {1: part}, 2, {"0": "black"})
-        ...     sorted(zipfile.ZipFile(f"{folder}/film.zarr.zip").namelist())[:4]
-        ['.zattrs', '.zgroup', 'contact/.zarray', 'contact/1.0.0']
+    Parts are files of :func:`torchvts.core.results.write_result` by row. The other rows hold NaN, and False in masks, and
+    ``left_out`` says why.
     """
     with write_atomically(path) as temporary, zipfile.ZipFile(temporary, "w") as archive:
         doubts: dict[str, str] = {}

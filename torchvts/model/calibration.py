@@ -15,13 +15,12 @@ from ..core.checks import (
     brief,
     check_decay,
     check_field,
-    check_float_tensor,
     check_image,
     check_positive,
     check_record,
     check_shape,
     check_switch,
-    check_tensor,
+    check_values,
 )
 from ..core.files import image_from_bytes, image_to_bytes, load_tensors, save_tensors
 from ..core.levels import SATURATED
@@ -111,20 +110,11 @@ class Calibration:
         if self.contact_decay_mm is not None:
             check_decay("contact_decay_mm", self.contact_decay_mm)
         read_report(self.report, "report")
-        if self.lights is not None:
-            for name, values in (("position_mm", self.lights.position_mm), ("albedo", self.lights.albedo)):
-                if not bool(torch.isfinite(values).all()):
-                    raise ValueError(f"lights.{name}: expected finite values, got {values.tolist()}: did a fit diverge?")
         if self.ambient is not None:
-            check_float_tensor("ambient", self.ambient)
-            if tuple(self.ambient.shape) != (3,) or not bool((self.ambient >= 0).all() & torch.isfinite(self.ambient).all()):
-                raise ValueError(f"ambient: expected (3,) finite values of at least 0, got {brief(self.ambient.tolist())}")
+            check_values("ambient", self.ambient, (3,), "of at least 0")
         check_field("background", self.background)
         check_shape("background", self.background, (3, self.sensor.height, self.sensor.width), f"sensor '{self.sensor.name}'")
-        check_float_tensor("noise_std", self.noise_std)
-        check_shape("noise_std", self.noise_std, (3,))
-        if not bool((torch.isfinite(self.noise_std) & (self.noise_std > 0)).all()):
-            raise ValueError(f"noise_std: expected finite values above 0, got {self.noise_std.tolist()}")
+        check_values("noise_std", self.noise_std, (3,), "above 0")
         if self.lights is None and self.response is None:
             raise ValueError("lights, response: expected one of them, got none: a calibration without a model")
         if self.lights is not None and self.response is not None:
@@ -133,9 +123,7 @@ class Calibration:
             self._check_covariance(self.covariance)
         if self.printed is not None:
             check_image("printed", self.printed, self.sensor.height, self.sensor.width, self.sensor.name)
-        if not self.measured:
-            return
-        if not bool((self.background > self.light_noise_std).any()):
+        if self.measured and not bool((self.background > self.light_noise_std).any()):
             raise ValueError(
                 f"background: expected light above the noise, got at most {float(self.background.max()):.3g}: black image, LEDs or "
                 "exposure off"
@@ -144,16 +132,11 @@ class Calibration:
     def _check_covariance(self, covariance: Tensor) -> None:
         if self.response is None:
             raise ValueError("covariance: expected None of a calibration by lights, got a tensor: it is that of a response field")
-        check_float_tensor("covariance", covariance)
         size = self.response.field.size()
-        check_shape("covariance", covariance, (size, size), "one row for each coefficient of a slope")
-        good = torch.isfinite(covariance).all() & (covariance == covariance.t()).all() & (covariance.diagonal() > 0).all()
-        if not bool(good):
+        check_values("covariance", covariance, (size, size))
+        if not bool((covariance == covariance.t()).all() & (covariance.diagonal() > 0).all()):
             least = float(covariance.diagonal().min())
-            raise ValueError(
-                "covariance: expected finite values, symmetric, with a positive diagonal, "
-                f"got others, least on the diagonal {least:.3g}: did a fit diverge?"
-            )
+            raise ValueError(f"covariance: expected a symmetric matrix with a positive diagonal, got {least:.3g} on the diagonal")
 
     @classmethod
     def from_lights(
@@ -184,14 +167,10 @@ class Calibration:
         check_sensor("sensor", sensor)
         sensor = dataclasses.replace(sensor, gamma=sensor.exponent, prior=None)
         frozen = PointLights(*(t.detach().cpu() for t in (lights.position_mm, lights.albedo, lights.gloss))).requires_grad_(False)
-        summary = read_report(
-            {"model": "point_lights", "source": "given", "doubts": []} | ({} if report is None else dict(report)), "report"
-        )
+        summary = read_report({"model": "point_lights", "source": "given", "doubts": []} | dict(report or {}), "report")
         if ambient is not None:
-            check_tensor("ambient", ambient)
+            check_shape("ambient", ambient, (3,))
             ambient = ambient.detach().cpu().to(frozen.position_mm.dtype)
-            if tuple(ambient.shape) != (3,):
-                raise ValueError(f"ambient: expected (3,), got {tuple(ambient.shape)}")
         if background is None:
             model = flat_image(frozen, sensor.height, sensor.width, sensor.mm_per_pixel)
             model = model if ambient is None else model + ambient.reshape(3, 1, 1)
@@ -228,14 +207,10 @@ class Calibration:
         """
         check_record("response", response, ResponseModel, "a sensor's prior has one: sensor.prior.response")
         check_sensor("sensor", sensor)
-        check_image("background", background, sensor.height, sensor.width, sensor.name)
         sensor = dataclasses.replace(sensor, gamma=response.gamma, blur_px=response.blur_px, prior=None)
-        summary = read_report(
-            {"model": "response", "source": "given", "doubts": []} | ({} if report is None else dict(report)), "report"
-        )
-        light, noise, markers, printed = _measure(background, sensor, background.dtype)
+        summary = read_report({"model": "response", "source": "given", "doubts": []} | dict(report or {}), "report")
+        light, noise, markers, printed = _measure(background, sensor)
         if covariance is not None:
-            check_tensor("covariance", covariance)
             check_shape("covariance", covariance, (response.field.size(),) * 2, "one row for each coefficient of a slope")
             covariance = covariance.detach().cpu().float()
             covariance = 0.5 * (covariance + covariance.mT)
@@ -479,10 +454,12 @@ def check_calibration(name: str, value: object) -> None:
     check_record(name, value, Calibration, "Calibration.load reads a file, calibrate makes one")
 
 
-def _measure(background: Tensor, sensor: Sensor, dtype: torch.dtype) -> tuple[Tensor, Tensor, FillMarkers | None, Tensor | None]:
+def _measure(
+    background: Tensor, sensor: Sensor, dtype: torch.dtype | None = None
+) -> tuple[Tensor, Tensor, FillMarkers | None, Tensor | None]:
     """Linear light of a background image, its noise in image value, the block that fills its markers, and the image with them."""
     check_image("background", background, sensor.height, sensor.width, sensor.name)
-    image = background.detach().cpu().to(dtype)
+    image = background.detach().cpu().to(dtype or background.dtype)
     markers = None if sensor.markers is False else FillMarkers.from_background(image)
     if markers is not None and (markers.diameter_px == 0 or (sensor.markers is None and not is_printed(image, markers))):
         markers = None

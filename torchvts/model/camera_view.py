@@ -1,6 +1,5 @@
 """How the sensor's image lies in the frames of its camera: bent by a lens, turned, mirrored, cut by a region, corners or a crop."""
 
-import math
 import warnings
 from functools import lru_cache
 from typing import TYPE_CHECKING, NamedTuple
@@ -15,7 +14,6 @@ if TYPE_CHECKING:
     from .sensor import Sensor
 
 Corners = tuple[tuple[float, float], ...]
-Matrix = tuple[tuple[float, ...], ...]
 
 MOST_BEYOND_PX = 1.0
 """Frames are sampled up to so far beyond their edge, px, where their outermost pixel is repeated."""
@@ -51,9 +49,7 @@ def is_raw(name: str, frame: Tensor, view: CameraView) -> bool:
     """Whether frames (B, 3, h, w) are raw, or the sensor's images already. Scripts.
 
     Frames of a whole multiple of the sensor's resolution count as raw, with a warning, where nothing is cut, turned or bent.
-
-    Raises:
-        ValueError: they are neither; says what they may be.
+    Others are refused.
     """
     rows, columns = frame.shape[2], frame.shape[3]
     for height, width in view.raw_sizes:
@@ -61,30 +57,24 @@ def is_raw(name: str, frame: Tensor, view: CameraView) -> bool:
             return True
     if view.place != "" and len(view.raw_sizes) == 0:
         return True
-    if view.place != "" or rows != view.size[0] or columns != view.size[1]:
-        times = rows // view.size[0]
-        plain = view.place == "" and view.raw_crop == 0.0 and view.turn_deg == 0 and not view.mirror and not view.bent
-        if plain and times >= 2 and rows == times * view.size[0] and columns == times * view.size[1]:
-            warnings.warn(
-                f"{name}: {rows} x {columns}, {times} times the resolution of sensor '{view.name}', is scaled: if that is right, "
-                f"raw_size_px: [[{rows}, {columns}]] in the sensor file says so; if the gel is only a part, roi_px",
-                stacklevel=2,
-            )
-            return True
-        raise ValueError(f"{name}: {_misfit(view, rows, columns)}")
-    return False
+    if view.place == "" and rows == view.size[0] and columns == view.size[1]:
+        return False
+    times = rows // view.size[0]
+    plain = view.place == "" and view.raw_crop == 0.0 and view.turn_deg == 0 and not view.mirror and not view.bent
+    if plain and times >= 2 and rows == times * view.size[0] and columns == times * view.size[1]:
+        warnings.warn(
+            f"{name}: {rows} x {columns}, {times} times the resolution of sensor '{view.name}', is scaled: if that is right, "
+            f"raw_size_px: [[{rows}, {columns}]] in the sensor file says so; if the gel is only a part, roi_px",
+            stacklevel=2,
+        )
+        return True
+    raise ValueError(f"{name}: {_misfit(view, rows, columns)}")
 
 
 def rectified(name: str, frame: Tensor, view: CameraView, places: Tensor | None) -> Tensor:
     """Images (B, 3, height, width) of raw frames (B, 3, h, w), sampled once and resized at most once. Scripts.
 
-    Args:
-        name: of the frames in errors.
-        frame: raw frames.
-        view: what is taken of them.
-        places: (1, h, w, 2) from :func:`places_in_frame`.
-    Raises:
-        ValueError: frames that do not contain the place of the gel.
+    ``places``, (1, h, w, 2), are those of :func:`places_in_frame`. Frames that do not contain the place of the gel are refused.
     """
     image = _sampled(frame, places) if view.bent and places is not None else _taken(name, frame, view, places)
     if image.shape[2] != view.size[0] or image.shape[3] != view.size[1]:
@@ -96,10 +86,7 @@ def rectified(name: str, frame: Tensor, view: CameraView, places: Tensor | None)
 def places_in_frame(sensor: "Sensor", frame_size: tuple[int, int]) -> Tensor | None:
     """Where each pixel of what is taken lies in frames of a size, (1, h, w, 2), x and y, px, float64; None where it is cut out.
 
-    Behind a lens in raw frames, otherwise in turned and mirrored ones, on whose size it does not depend.
-
-    Raises:
-        ValueError: behind a lens, places beyond the frame.
+    Behind a lens in raw frames, within which they must lie; otherwise in turned and mirrored ones, whose size does not matter.
     """
     if sensor.corners_px is None and sensor.camera_matrix is None:
         return None
@@ -194,11 +181,9 @@ def _misfit(view: CameraView, rows: int, columns: int) -> str:
 def camera_above(sensor: "Sensor") -> tuple[float, float, float] | None:
     """Where the camera of a sensor stands above the middle of the skin, mm: along x and y of the image, and height.
 
-    Four corners of the skin, which is a plane, and their places in frames without distortion give its pose.
+    Four corners of the skin, which is a plane, and their places in frames without distortion give its pose. None without a camera
+    matrix, or where the size of raw frames must be known and is not: of turned or mirrored ones, and without a region or corners.
 
-    Returns:
-        None without a camera matrix, or where the size of raw frames must be known and is not: of turned or mirrored ones, and of
-        those without a region or corners.
     Source:
         Zhang, A flexible new technique for camera calibration, PAMI 22(11), 2000, section 3.1.
     """
@@ -249,12 +234,6 @@ def check_corners(value: object) -> Corners:
     return corners
 
 
-def sides_of(corners: Corners) -> tuple[float, float]:
-    """Mean length of the sides along x, and along y, pixels."""
-    top, right, bottom, left = (math.dist(corners[k], corners[(k + 1) % 4]) for k in range(4))
-    return 0.5 * (top + bottom), 0.5 * (right + left)
-
-
 def check_raw_sizes(value: object) -> tuple[tuple[int, int], ...]:
     """Return sizes (height, width) of raw frames, or raise."""
     if not isinstance(value, list | tuple) or not all(isinstance(size, list | tuple) for size in value):
@@ -265,7 +244,7 @@ def check_raw_sizes(value: object) -> tuple[tuple[int, int], ...]:
     return tuple((int(numbers[k]), int(numbers[k + 1])) for k in range(0, len(numbers), 2))
 
 
-def check_lens(matrix: object, coefficients: object) -> tuple[Matrix, tuple[float, ...]]:
+def check_lens(matrix: object, coefficients: object) -> tuple[tuple[tuple[float, ...], ...], tuple[float, ...]]:
     """Return OpenCV's camera matrix and distortion coefficients, or raise."""
     if matrix is None or coefficients is None:
         raise ValueError("camera_matrix, distortion_coefficients: expected both or none: cv2.calibrateCamera gives both")

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor, nn
 
-from ..core.checks import brief, check_batch, check_camera_height, check_positive, check_record, check_same_size, check_tensor
+from ..core.checks import brief, check_batch, check_camera_height, check_positive, check_record, check_same_size, check_values
 from ..core.geometry import pixel_grid_mm
 
 
@@ -37,25 +37,17 @@ class PointLights(nn.Module):
         position, rho = _numbers("position_mm", position_mm), _numbers("albedo", albedo)
         dtype = torch.promote_types(torch.promote_types(position.dtype, rho.dtype), torch.float32)
         position, rho = position.to(dtype), rho.to(dtype)
-        if tuple(position.shape) != (3, 3):
-            raise ValueError(f"position_mm: expected (3, 3), rows R, G, B, got {tuple(position.shape)}")
-        if tuple(rho.shape) != (3,):
-            raise ValueError(f"albedo: expected (3,), one per channel, got {tuple(rho.shape)}")
-        for name, values in (("position_mm", position), ("albedo", rho)):
-            if not bool(torch.isfinite(values).all()):
-                raise ValueError(f"{name}: expected finite values, got {values.tolist()}")
+        shine = torch.zeros(3, dtype=dtype) if gloss is None else _numbers("gloss", gloss).to(dtype)
+        check_values("position_mm", position, (3, 3))
+        check_values("albedo", rho, (3,), "above 0")
+        check_values("gloss", shine, (3,), "of at least 0")
         if not bool((position[:, 2] > 0).all()):
             raise ValueError(
                 f"position_mm: expected lights above the skin (z > 0), got z = {position[:, 2].tolist()}: z points to the camera"
             )
-        if not bool((rho > 0).all()):
-            raise ValueError(f"albedo: expected values above 0, got {rho.tolist()}")
-        shine = torch.zeros(3, dtype=dtype) if gloss is None else _numbers("gloss", gloss).detach().to(dtype)
-        if tuple(shine.shape) != (3,) or not bool((shine >= 0).all() & torch.isfinite(shine).all()):
-            raise ValueError(f"gloss: expected (3,) finite values of at least 0, got {shine.tolist()}")
         self.position_mm = nn.Parameter(position.detach().clone())
         self.albedo = nn.Parameter(rho.detach().clone())
-        self.register_buffer("gloss", shine.clone())
+        self.register_buffer("gloss", shine.detach().clone())
         self.glossy = bool((shine > 0).any())
 
     if TYPE_CHECKING:
@@ -89,7 +81,6 @@ def _numbers(name: str, values: object) -> Tensor:
         tensor = torch.as_tensor(values, dtype=torch.float32 if isinstance(values, list | tuple) else None)
     except (TypeError, ValueError, RuntimeError, OverflowError) as error:
         raise TypeError(f"{name}: expected numbers, got {brief(values)}: a tensor, or lists of floats") from error
-    check_tensor(name, tensor)
     if tensor.is_complex() or tensor.element_size() < 2:
         raise TypeError(f"{name}: expected float32 or float64, got {tensor.dtype}: use .float()")
     return tensor
@@ -133,12 +124,8 @@ def cast_shadows(depth_mm: Tensor, lights: PointLights, mm_per_pixel: float) -> 
     between pixels) is above the ray by more than a twentieth of a pixel, the light is blocked. Beyond the image the skin is
     undeformed. Attached shadows are not included: :func:`near_field_shading` clamps them.
 
-    Args:
-        depth_mm: (B, 1, H, W), positive towards the camera.
-        lights: the three lights.
-        mm_per_pixel: pixel pitch, mm.
     Returns:
-        (B, 3, H, W), a factor for the image of each light. Not differentiable, because its edges are sharp.
+        (B, 3, H, W), a factor for the image of each light, of depth (B, 1, H, W). Not differentiable: its edges are sharp.
     Example:
         >>> wall = torch.zeros(1, 1, 8, 16); wall[..., 8] = 2.0
         >>> lights = PointLights([[40, 0, 20], [-40, 0, 20], [0, 40, 20]], [900, 900, 900])
@@ -182,12 +169,8 @@ def flat_image(lights: PointLights, height: int, width: int, mm_per_pixel: float
 
 
 def seen_at(undeformed_mm: Tensor, depth_mm: Tensor, camera_height_mm: float) -> Tensor:
-    """x or y of the point that a pixel sees. A pinhole camera at height h sees X = u (h - z) / h.
+    """x or y of the point that a pixel sees at a depth, which is u on the undeformed skin: u (h - z) / h; u for infinite h.
 
-    Args:
-        undeformed_mm: u, x or y of the point of the undeformed skin that the pixel sees; broadcast against depth_mm.
-        depth_mm: z.
-        camera_height_mm: h; infinite for an orthographic camera, X = u.
     Example:
         >>> seen_at(torch.tensor([-10.0, 10.0]), torch.tensor(2.0), 20.0)
         tensor([-9.,  9.])
@@ -200,16 +183,8 @@ def seen_at(undeformed_mm: Tensor, depth_mm: Tensor, camera_height_mm: float) ->
 def light_matrix(
     depth_mm: Tensor, position_mm: Tensor, albedo: Tensor, mm_per_pixel: float, camera_height_mm: float = math.inf
 ) -> Tensor:
-    """The matrix L of ``I = L n``: row j is rho^j (S^j - P) / |S^j - P|^3.
+    """The matrix L of ``I = L n``, (B, 3, 3, H, W), light, axis, row, column: row j is rho^j (S^j - P) / |S^j - P|^3.
 
-    Args:
-        depth_mm: (B, 1, H, W), mm.
-        position_mm: (3, 3), mm.
-        albedo: (3,).
-        mm_per_pixel: pixel pitch, mm.
-        camera_height_mm: as for :func:`seen_at`.
-    Returns:
-        (B, 3, 3, H, W): light, axis, row, column.
     Source:
         eq. 2 of the paper.
     """
@@ -235,13 +210,11 @@ without a material of its own."""
 
 
 def gloss_lobe(matrix: Tensor, normal: Tensor) -> Tensor:
-    """Rough specular lobe relative to matt shading, at unit gloss; the camera looks along z.
+    """Rough specular lobe relative to matt shading at unit gloss, (B, 3, H, W); the camera looks along z.
 
     Args:
         matrix: (B, 3, 3, H, W), light matrix, or anything whose rows point to the lights.
         normal: (B, 3, H, W), unit.
-    Returns:
-        (B, 3, H, W), D V of the microfacet model, at least 0.
     Source:
         Walter, Marschner, Li, Torrance, Microfacet models for refraction through rough surfaces, EGSR 2007 (GGX); Karis, Real
         shading in Unreal Engine 4, SIGGRAPH course 2013, for the masking term, which renderers of glTF take.
@@ -267,17 +240,14 @@ def log_slope_of_lobe(n_l: Tensor, n_h: Tensor, roughness: float = GLOSS_ROUGHNE
 
 
 def glossy_light(rows: Tensor, normal: Tensor, gloss: Tensor, roughness: float = GLOSS_ROUGHNESS) -> tuple[Tensor, Tensor]:
-    """Light of N pixels of a glossy skin and its derivative in the normal, without the clamp of attached shadows.
+    """Light of N pixels of a glossy skin, (N, 3), and its derivative in the normal, without the clamp of attached shadows.
 
     Args:
         rows: (N, 3, 3), light matrix.
         normal: (N, 3), unit.
         gloss: (3,).
-        roughness: of the lobe.
     Returns:
         (N, 3); (N, 3, 3): light, axis.
-    Source:
-        the derivative of :func:`microfacet`.
     """
     to_light = rows * torch.rsqrt((rows * rows).sum(2, keepdim=True))
     to_half = torch.rsqrt(2.0 + 2.0 * to_light[:, :, 2])
@@ -301,8 +271,6 @@ def inverse_light_matrix(
     With a_j = S^j - P the rows of L are rho^j a_j / |a_j|^3, so column j of the inverse is
     (a_k x a_l) |a_j|^3 / (rho^j det[a_1 a_2 a_3]), j, k, l cyclic, and a_k x a_l = S^k x S^l - P x (S^l - S^k) is linear in P.
 
-    Args:
-        depth_mm, position_mm, albedo, mm_per_pixel, camera_height_mm: as for :func:`light_matrix`.
     Returns:
         (B, 3, 3, H, W): normal axis, light, row, column.
     Source:
@@ -343,11 +311,8 @@ def normal_at_depth(
     The columns of L^-1 (:func:`inverse_light_matrix`) share the determinant, of which a direction needs the sign only. With
     t_j = I^j |a_j|^3 / rho^j the rest is sum_j t_j S^k x S^l - P x sum_j t_j (S^l - S^k), j, k, l cyclic.
 
-    Args:
-        image: (B, 3, H, W), linear light.
-        depth_mm, position_mm, albedo, mm_per_pixel, camera_height_mm: as for :func:`light_matrix`.
     Returns:
-        (B, 3, H, W); zero where the image is zero.
+        (B, 3, H, W), of linear light (B, 3, H, W); zero where the image is zero.
     Source:
         eq. 10 of the paper.
     """

@@ -147,12 +147,6 @@ def find_dots(background: Tensor, markers: "FillMarkers") -> Tensor:
     """Centres of the printed dots of a background (3, H, W): (N, 2) float64, x and y in pixels; specks are none.
 
     A centre is the mean place of what a dot takes from the logarithm of light.
-
-    Example:
-        >>> image = torch.full((3, 64, 64), 0.5)
-        >>> image[:, 20:27, 30:37] = 0.1
-        >>> find_dots(image, FillMarkers()).round(decimals=3)
-        tensor([[33., 23.]], dtype=torch.float64)
     """
     if markers.diameter_px == 0.0:
         return torch.zeros(0, 2, dtype=torch.float64)
@@ -163,15 +157,7 @@ def find_dots(background: Tensor, markers: "FillMarkers") -> Tensor:
 
 
 def is_printed(background: Tensor, markers: "FillMarkers") -> bool:
-    """Whether what is found in a background (3, H, W) is a regular pattern of dots, and not dust.
-
-    Example:
-        >>> image = torch.full((3, 120, 160), 0.5)
-        >>> for row, column in ((y, x) for y in range(10, 120, 20) for x in range(10, 160, 20)):
-        ...     image[:, row - 2 : row + 3, column - 2 : column + 3] = 0.1
-        >>> is_printed(image, FillMarkers.from_background(image))
-        True
-    """
+    """Whether what is found in a background (3, H, W) is a regular pattern of dots, and not dust."""
     dots = find_dots(background, markers)
     if len(dots) < LEAST_PRINTED:
         return False
@@ -261,11 +247,9 @@ def _log_light(image: Tensor, cell: int) -> Tensor:
 
 
 def _marker_depth(light: Tensor, diameter: float, contrast: float, sigmas: float) -> tuple[Tensor, Tensor, Tensor]:
-    """How much darker a pixel is than both sides, as the logarithm of value.
+    """How much darker a pixel is than both sides, as the logarithm of value, and the least depth that counts, (B, 1, 1, 1).
 
-    Returns:
-        The depth of the least channel and of the mean of channels, (B, 1, H, W) each, the first -9 on a step, which is dark on
-        one side only; and the least depth that counts, (B, 1, 1, 1).
+    The depth of the least channel and of the mean of channels, (B, 1, H, W) each, the first -9 on a step, dark on one side only.
     """
     far = max(2, int(diameter + 0.5))
     near = max(1, int(0.7071 * diameter + 0.5))

@@ -13,15 +13,8 @@ COUNTS_LITTLE = 0.5
 Model = Literal["point_lights", "response"]
 
 Source = Literal["given", "sensor_file", "background", "prior", "presses", "stand_in"]
-"""Where the model comes from.
-
-* given: the caller gave the model.
-* sensor_file: the sensor file gives the positions of the lights.
-* background: lights were fitted to the image without contact.
-* prior: the response of the sensor type.
-* presses: a response was fitted to presses of balls.
-* stand_in: a rough response from the directions of lights whose positions do not fit the image; depth is not metric.
-"""
+"""Where the model comes from: the caller, positions of lights in the sensor file, a fit of lights to the image without contact, the
+response of the sensor type, presses of balls; stand_in: directions of lights whose positions do not fit, so depth is not metric."""
 
 
 class Tried(TypedDict):
@@ -38,13 +31,8 @@ class Tried(TypedDict):
     doubts: list[str]
 
 
-class _PressKeys(TypedDict):
-    name: str
-    used: bool
-
-
-class PressRow(_PressKeys, total=False):
-    """What became of one press.
+class PressRow(TypedDict, total=False):
+    """What became of one press. Only ``name`` and ``used`` are always there.
 
     Attributes:
         name: of the press.
@@ -58,6 +46,8 @@ class PressRow(_PressKeys, total=False):
         gain_std: standard deviation of that, as far as the other presses know the place; absent where a prior is compared.
     """
 
+    name: str
+    used: bool
     reason: str
     center_px: Any  # two numbers
     contact_radius_px: float
@@ -67,12 +57,7 @@ class PressRow(_PressKeys, total=False):
     gain_std: float
 
 
-class _ReportKeys(TypedDict):
-    model: Model
-    source: Source
-
-
-class Report(_ReportKeys, total=False):
+class Report(TypedDict, total=False):
     """Summary of a calibration: a dict of plain JSON values. Only ``model`` and ``source`` are always there.
 
     Attributes:
@@ -96,6 +81,8 @@ class Report(_ReportKeys, total=False):
         camera_height_mm: height of a pinhole camera above the skin, where it is known.
     """
 
+    model: Model
+    source: Source
     reason: str
     tried: list[Tried]
     doubts: list[str]
@@ -118,11 +105,8 @@ def warnings_of(report: Report) -> list[str]:
 
 
 def read_report(values: Any, source: str) -> Report:
-    """Check a report read from a file.
+    """Check a report; ``source`` names it in errors.
 
-    Args:
-        values: what the file holds.
-        source: names the file in errors.
     Raises:
         ValueError: not a mapping, or ``model`` or ``source`` is missing or unknown.
     Example:

@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
-from ..core.checks import brief, check_integer, check_least, check_numbers, check_positive, from_dict
+from ..core.checks import brief, check_integer, check_least, check_numbers, check_positive, check_record, check_sequence, from_dict
 from ..core.geometry import pixel_grid_mm
 
 _Kind = TypeVar("_Kind", bound="_Coefficients")
@@ -196,8 +196,7 @@ class ResponseModel:
     blur_px: float = 1.0
 
     def __post_init__(self) -> None:
-        if not isinstance(self.field, ResponseField):
-            raise TypeError(f"field: expected a ResponseField, got {brief(self.field)}")
+        check_record("field", self.field, ResponseField)
         if self.by_depth is not None and not isinstance(self.by_depth, DepthBrightness):
             raise TypeError(f"by_depth: expected a DepthBrightness or None, got {brief(self.by_depth)}")
         object.__setattr__(self, "gamma", check_positive("gamma", self.gamma, 10.0))
@@ -218,14 +217,7 @@ class ResponseModel:
     @classmethod
     def from_dict(cls, values: Any, source: str) -> "ResponseModel":
         """Read the output of :meth:`to_dict`; ``source`` names it in errors."""
-        if not isinstance(values, dict):
-            raise ValueError(f"{source}: expected keys and values, got {type(values).__name__}")
-        values = dict(values)
-        if values.get("field") is not None:
-            values["field"] = ResponseField.from_dict(values["field"], f"{source}: field")
-        if values.get("by_depth") is not None:
-            values["by_depth"] = DepthBrightness.from_dict(values["by_depth"], f"{source}: by_depth")
-        return from_dict(cls, values, source)
+        return from_dict(cls, values, source, {"field": ResponseField.from_dict, "by_depth": DepthBrightness.from_dict})
 
 
 def sine_from_slope(slope: Tensor) -> Tensor:
@@ -271,14 +263,15 @@ class SensorPrior:
     precision: float = 0.1
 
     def __post_init__(self) -> None:
-        if not isinstance(self.response, ResponseModel):
-            raise TypeError(f"response: expected a ResponseModel, got {type(self.response).__name__}")
+        check_record("response", self.response, ResponseModel)
         numbers = check_numbers("log_background", self.log_background, (3, 15))
         object.__setattr__(self, "log_background", (numbers[:15], numbers[15:30], numbers[30:]))
         object.__setattr__(self, "half_mm", check_positive("half_mm", self.half_mm))
         if not isinstance(self.source, str):
             raise TypeError(f"source: expected a text, got {brief(self.source)}")
-        object.__setattr__(self, "held_out_deg", _angles(self.held_out_deg))
+        check_sequence("held_out_deg", self.held_out_deg, "degrees, one per unit")
+        angles = tuple(check_positive("held_out_deg", angle, 90.0) for angle in self.held_out_deg)
+        object.__setattr__(self, "held_out_deg", angles)
         if self.own_deg is not None:
             object.__setattr__(self, "own_deg", check_positive("own_deg", self.own_deg, 90.0))
         for name in ("power", "precision"):
@@ -310,25 +303,14 @@ class SensorPrior:
     @classmethod
     def from_dict(cls, values: Any, source: str) -> "SensorPrior":
         """Read the output of :meth:`to_dict`; ``source`` names it in errors."""
-        if not isinstance(values, dict):
-            raise ValueError(f"{source}: expected keys and values, got {type(values).__name__}")
-        values = dict(values)
-        version = values.pop("version", None)
-        if version != PRIOR_VERSION or isinstance(version, bool):
-            raise ValueError(
-                f"{source}: expected version {PRIOR_VERSION} of a prior, got {brief(version)}: written by another torchvts; fit it "
-                "again with scripts/fit_prior.py, or update torchvts"
-            )
-        if "response" in values:
-            values |= {"response": ResponseModel.from_dict(values["response"], f"{source}: response")}
-        return from_dict(cls, values, source)
-
-
-def _angles(value: object) -> tuple[float, ...]:
-    """One angle per unit."""
-    if not isinstance(value, list | tuple):
-        raise TypeError(f"held_out_deg: expected a list of degrees, one per unit, got {brief(value)}: write [3.5] for one unit")
-    return tuple(check_positive("held_out_deg", angle, 90.0) for angle in value)
+        if isinstance(values, dict):
+            values = dict(values)
+            if (version := values.pop("version", None)) != PRIOR_VERSION or isinstance(version, bool):
+                raise ValueError(
+                    f"{source}: expected version {PRIOR_VERSION} of a prior, got {brief(version)}: written by another torchvts; "
+                    "fit it again with scripts/fit_prior.py, or update torchvts"
+                )
+        return from_dict(cls, values, source, {"response": ResponseModel.from_dict})
 
 
 def term_degrees_by_term(degree: int, product_degree: int, cubic_degree: int = -1) -> dict[tuple[int, ...], int]:
@@ -364,15 +346,7 @@ def image_basis(height: int, width: int, mm_per_pixel: float, half_mm: float, de
 
 
 def term_values(change: Tensor, x: Tensor, y: Tensor, half_mm: float, degrees: dict[tuple[int, ...], int]) -> Tensor:
-    """Factor of every coefficient at N places: (size, N).
-
-    Args:
-        change: (3, N), image / background - 1.
-        x: (N,), mm.
-        y: (N,), mm.
-        half_mm: scale of positions, mm.
-        degrees: degree in position of every term, see :func:`term_degrees_by_term`.
-    """
+    """Factor of every coefficient, (size, N), at N places, mm, for changes of light (3, N) and :func:`term_degrees_by_term`."""
     inputs = change / CHANGE_SCALE
     bases = {degree: position_basis(x, y, half_mm, degree) for degree in set(degrees.values())}
     products = {term: math.prod([inputs[k] for k in term[1:]], start=inputs[term[0]]) for term in degrees}

@@ -29,18 +29,8 @@ from ..core.files import read_image, write_atomically
 from ..core.geometry import check_rigid
 from ..core.spelling import suggest
 from ..core.strict_yaml import read_yaml
-from .camera_view import (
-    CameraView,
-    camera_above,
-    check_corners,
-    check_lens,
-    check_raw_sizes,
-    is_raw,
-    places_in_frame,
-    rectified,
-    sides_of,
-)
-from .gs_sdk_sensor import is_gs_sdk_sensor, values_from_gs_sdk
+from .camera_view import CameraView, camera_above, check_corners, check_lens, check_raw_sizes, is_raw, places_in_frame, rectified
+from .gs_sdk_sensor import values_from_gs_sdk
 from .response_field import SensorPrior
 
 LEAST_PITCH_MM = 5e-4
@@ -119,9 +109,7 @@ class Sensor:
         if self.mm_per_pixel < LEAST_PITCH_MM:
             raise ValueError(f"mm_per_pixel: expected at least {LEAST_PITCH_MM:g} mm, got {self.mm_per_pixel:g}: is it in m?")
         if self.gamma is not None:
-            self._set("gamma", check_positive("gamma", self.gamma, 10.0))
-        if self.gamma is not None and self.gamma < 0.1:
-            raise ValueError(f"gamma: expected a number in [0.1, 10], got {self.gamma}: value = light^(1/gamma), 2.2 for sRGB-like")
+            self._set("gamma", check_least("gamma", self.gamma, 0.1, 10.0))
         self._set("blur_px", check_least("blur_px", self.blur_px, 0.0, 0.25 * min(self.height, self.width)))
         if self.light_position_mm is not None:
             numbers = check_numbers("light_position_mm", self.light_position_mm, (3, 3))
@@ -140,8 +128,8 @@ class Sensor:
         prior: object = self.prior
         if isinstance(prior, dict):  # as YAML gives it
             self._set("prior", SensorPrior.from_dict(prior, "prior"))
-        elif prior is not None and not isinstance(prior, SensorPrior):
-            raise TypeError(f"prior: expected a SensorPrior, got {type(prior).__name__}")
+        elif prior is not None:
+            check_record("prior", prior, SensorPrior)
 
     def _check_view(self) -> None:
         """Check what leads from raw frames to the sensor's images."""
@@ -187,7 +175,8 @@ class Sensor:
 
     def _check_corners(self, corners_px: tuple[tuple[float, float], ...]) -> None:
         """Raise where corners are of another aspect than a gel seen from aside can have."""
-        across, down = sides_of(corners_px)
+        top, right, bottom, left = (math.dist(corners_px[k], corners_px[(k + 1) % 4]) for k in range(4))
+        across, down = 0.5 * (top + bottom), 0.5 * (right + left)
         if abs(math.log(across / down * self.height / self.width)) > math.log(MOST_OBLIQUE):
             raise ValueError(
                 f"corners_px: expected a gel about {self.width / self.height:.2f} times as wide as high, as width x height "
@@ -344,7 +333,7 @@ class Sensor:
         """
         path = _find(source)
         values = read_yaml(path)
-        if is_gs_sdk_sensor(values):
+        if isinstance(values, dict) and "ppmm" in values:
             values = values_from_gs_sdk(values, str(path), path.stem)
         sensor = cls.from_dict(values, str(path))
         if height is None and width is None:
@@ -381,13 +370,6 @@ def with_square_pixels(values: dict[str, Any], source: str) -> dict[str, Any]:
     """The values of a sensor whose pixels are not square, [along x, along y], mm, as those of one whose images are resampled.
 
     The coarser pitch stays, and ``corners_px`` are those of what was seen, so that :class:`Rectify` makes pixels square.
-
-    Raises:
-        ValueError: not two pitches within 1.5 of each other, or beside keys that say the shape already.
-    Example:
-        >>> sensor = Sensor.from_dict({"name": "rig", "height": 240, "width": 320, "mm_per_pixel": [0.1, 0.109]}, "rig.yaml")
-        >>> sensor.mm_per_pixel, sensor.height, sensor.width, sensor.raw_size_px
-        (0.109, 240, 294, ((240, 320),))
     """
     along = check_numbers("mm_per_pixel", values["mm_per_pixel"], (2,))
     if min(along) <= 0.0 or max(along) > MOST_OBLIQUE * min(along):

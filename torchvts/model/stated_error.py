@@ -31,14 +31,7 @@ PRESSED_SINE = 0.25
 
 
 def variance_of(factors: Tensor, covariance: Tensor) -> Tensor:
-    """phi' C phi: variance of a sine, up to the noise of a press.
-
-    Args:
-        factors: phi, (K, N).
-        covariance: C, (K, K).
-    Returns:
-        (N,).
-    """
+    """phi' C phi for N phi, (K, N), and C, (K, K): variance of a sine, up to the noise of a press."""
     variance: Tensor = (factors * (covariance @ factors)).sum(0)
     return variance
 
@@ -53,7 +46,7 @@ def stated_deg(own_deg: float, variance: Tensor, not_learned: float = NOT_LEARNE
     Args:
         own_deg: mean error of the field on its own presses, degrees.
         variance: phi' C phi, any shape.
-        not_learned: :data:`NOT_LEARNED`.
+        not_learned: :data:`NOT_LEARNED`; an argument, as TorchScript takes no global number.
         beside_deg: :data:`BESIDE_DEG`.
     Example:
         >>> round(float(stated_deg(2.0, torch.tensor(0.0))), 2), round(float(stated_deg(2.0, torch.tensor(30.0))), 2)
@@ -213,10 +206,9 @@ def press_next(calibration: Calibration) -> tuple[tuple[int, int], float] | None
 
 
 def error_over_skin(calibration: Calibration) -> tuple[Tensor, int, float] | None:
-    """The error to expect of slopes like the presses', and how large contacts are; None as :func:`press_next`.
+    """The error to expect of slopes like the presses' on cells (h, w), degrees, pixels of a cell, and of a contact's median radius.
 
-    Returns:
-        (h, w), mean error of normals on cells, degrees; pixels of a cell; the median radius of contacts, pixels.
+    None as :func:`press_next`.
     """
     check_calibration("calibration", calibration)
     block, sensor, response = _stated_by_covariance(calibration), calibration.sensor, calibration.response

@@ -17,27 +17,12 @@ NOT_METRIC = "depth is NOT METRIC"
 SATURATED_SHARE = 0.05
 """Share of the calibration's image that is saturated in a channel from which it is said."""
 
-BY = {
-    "given": "given",
-    "sensor_file": "positions from the sensor file",
-    "background": "fitted to the image without contact",
-    "prior": "the prior of the sensor's type, by this unit's background",
-    "presses": "fitted to presses",
-    "stand_in": "directions of the sensor file's lights, as a stand-in",
-}
-"""Where a model comes from, in words, for reports without a reason."""
-
 
 def summary_of(calibration: Calibration, tried: bool = False) -> str:
-    """A few lines about a calibration, those of ``print(calibration)``.
-
-    Args:
-        calibration: of the unit.
-        tried: with all models that were made, the lights and all presses.
-    """
+    """The lines of ``print(calibration)``; with ``tried`` also all models that were made, the lights and all presses."""
     report, sensor = calibration.report, calibration.sensor
     kind = "point lights" if report["model"] == "point_lights" else "response field"
-    reason = report.get("reason", BY[report["source"]])
+    reason = report.get("reason", report["source"].replace("_", " "))
     size = f"{sensor.height} x {sensor.width} px, {sensor.mm_per_pixel:g} mm per pixel, gamma {sensor.exponent:g}"
     lines = [
         f"sensor: {sensor.name}, {size}",

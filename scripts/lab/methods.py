@@ -66,7 +66,7 @@ class Method:
         from_calibration: builds it for a calibrated unit; None if it must learn from presses.
         from_presses: builds it from presses; None if it is not compared on presses.
         style: arguments of Matplotlib's ``plot``.
-        ours: whether it is a method of this library, and not of a peer.
+        ours: whether it is the library's own way, and not there for comparison.
         learns: whether the presses influence it, so that every fold of a cross-validation needs its own.
         seen: whether it may have learned from the very presses that it is scored on.
         needs_prior: whether it is a variant for sensors that have a prior.

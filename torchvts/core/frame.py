@@ -41,8 +41,8 @@ class Conditions(NamedTuple):
     """What frames were seen under.
 
     Attributes:
-        light: (B, 3, 6), the light over the background's, a surface in each channel: its mean, then five terms that are each of
-            mean square 1 over the image, see :class:`torchvts.compensate.Relight`. 1, 0, 0, 0, 0, 0 where nothing has changed.
+        light: (B, 3, 6), the light over the background's, a surface in each channel: coefficients of 1, x, y, P2(x), x y, P2(y),
+            Legendre polynomials over the image, each of mean square 1. 1, 0, 0, 0, 0, 0 where nothing has changed.
         lost: (B, 3), share of each channel that is black or saturated where the background is not.
         unseen_deg: (B,), slope below which skin looks like the undeformed skin of the frame, degrees.
     """

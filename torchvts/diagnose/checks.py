@@ -23,7 +23,7 @@ from .findings import FAULT_DEG, WARNING_DEG, Finding, by_cost
 
 CHANNELS = ("red", "green", "blue")
 
-LEAST_LIGHT = 0.05
+LIGHT_REPORTED = 0.05
 """Change of a channel's light that is reported, relative."""
 
 ROUGH_FREE_DEG = 6.0
@@ -364,13 +364,13 @@ CHECKS = (
     Check("lights_coplanar", _coplanar, "the lights lie nearly in one plane (smallest singular value of their directions "
           "{value:.2f}, usual is 0.8): noise alone changes normals by {cost:.1f} degrees; increase the distance of the LEDs"),
     Check("lights_misfit", _light_at_calibration, "the calibration's lights do not explain its own image ({levels}; uneven by "
-          "{uneven:.1%}): other lights, stray light, or a lens; use presses or a prior", above=LEAST_LIGHT),
+          "{uneven:.1%}): other lights, stray light, or a lens; use presses or a prior", above=LIGHT_REPORTED),
     # the background of now
     Check("led_failed", lambda e: _failed(e, e.given), "the {colors} LED has failed (its channel of the background is black "
           "everywhere): check LED and cable; {left}", "fault", above=0.0),
     Check("contact_in_background", _contact_in_background, _CONTACT.format("background", "in the calibration's"), "fault"),
     Check("light_changed", _light_of_background, "the background's light is {levels} of that at calibration, uneven by "
-          "{uneven:.1%}: what is smooth is divided out", _by_unevenness, above=LEAST_LIGHT),
+          "{uneven:.1%}: what is smooth is divided out", _by_unevenness, above=LIGHT_REPORTED),
     # the camera
     Check("few_bits", _bits, "the {which} has only {value:.0f} bits: rounding changes normals by {cost:.1f} degrees; read the "
           "camera with 8 bits or more", lambda figures: by_cost(figures["cost"])),
@@ -394,7 +394,7 @@ CHECKS = (
           "changed; use its own calibration, or calibrate again", above=OTHER_PATTERN),
     Check("light_changed", lambda e: _change_of(e.conditions), "the light of free skin is {levels} of that at calibration, "
           "uneven by {uneven:.1%}: what is smooth is divided out, gamma, saturation, ambient light or another unit are not: set "
-          "the camera as at calibration, shade the sensor, or recalibrate", _by_unevenness, above=LEAST_LIGHT),
+          "the camera as at calibration, shade the sensor, or recalibrate", _by_unevenness, above=LIGHT_REPORTED),
     Check("unseen_slopes", _unseen, "the least changed skin scatters {times:.0f} times as much as at calibration: slopes below "
           "{value:.0f} degrees are in doubt", "note", above=UNSEEN_DEG),
     Check("new_spots", _spots, "{value:.0f} spots that were not there at calibration ({share:.1%} of the image{dead}): clean the "

@@ -35,8 +35,8 @@ class NormalModel(nn.Module):
         normals_from_depth: all modes return the gradient of the depth: integration keeps only what is the slope of
             a surface, so it has less noise and smaller errors than the slopes of single pixels.
         passes: how often mode "precise" solves a frame.
-        calibrated: its slopes are the skin's, not those of a network that may still be in training: they count where the skin
-            has moved, beside the colour. What a model gives that does not declare it is checked.
+        calibrated: True: its slopes, beside the colour, decide where the skin has moved, and its normals are not checked. False,
+            as of a network that may be in training: colour alone decides, and its normals are checked.
         input_domain: what ``forward`` works on, a key of :data:`DOMAINS`; a pipeline whose compensated images are something else
             is refused. None: it gets what the pipeline gives.
     Example:

@@ -20,7 +20,7 @@ DECAY_MM = 1.5
 """L, the length on which free skin decays."""
 
 SMOOTH_MM = 0.35
-"""Slope of the offset that costs as much as a pressure of so many mm."""
+"""Pressure, mm, that costs as much as an offset of slope 1."""
 
 STIFF = 30.0
 """How much stiffer the deepest skin is against the offset: slopes are calibrated in contacts, and least known around them."""
@@ -32,7 +32,7 @@ PIT = 2.0
 """Weight of depth below zero in moved skin: skin is pressed in and never pulled out."""
 
 PIT_SHARE = 0.01
-"""Depth below zero that is left, as a share of the frame's range."""
+"""Depth below zero that is let be, as a share of the frame's range; at twice that a pit has its full weight."""
 
 
 class ZeroBackground(nn.Module):
@@ -95,7 +95,7 @@ class ZeroBackground(nn.Module):
         reach = (depth.amax(dim=(1, 2), keepdim=True) - depth.amin(dim=(1, 2), keepdim=True)).clamp_min(1e-9)
         free, flat = (weight < 0.1).flatten(1), depth.flatten(1)
         any_free = free.any(dim=1)
-        # free cells may be faces of an object; no skin lies below the undeformed
+        # the lower quartile of free cells; or the lower eighth of all, if that is lower: free cells may be faces of an object
         start = -torch.minimum(lower_part(flat, free, 4), lower_part(flat, any_free[:, None].expand_as(free), 8))
         z = depth + start[:, :, None]
         unchanged = (1.0 - weight) / (1.0 + (z / (self.face * reach)).square()).square()

@@ -31,8 +31,8 @@ class TrainingPixels(NamedTuple):
     """Pixels on balls.
 
     Attributes:
-        intensity: (N, 3).
-        xy: (N, 2), column and row.
+        intensity: (N, 3), compensated R, G, B.
+        xy: (N, 2), column and row, of the same dtype.
         slope: (N, 2), mm per mm.
         press: (N,), index of the press.
     """
@@ -59,7 +59,7 @@ def training_pixels(compensate: nn.Module, presses: Sequence[Press], mm_per_pixe
     """Pixels on balls, :data:`torchvts.training.balls.RIM_PX` inside their contact radius, and the slope there.
 
     Args:
-        compensate: module that prepares the images.
+        compensate: ``Compensate.from_calibration(calibration)``, as the pipeline's.
         presses: presses with centres and contact radii.
         mm_per_pixel: pixel pitch, mm.
     Raises:

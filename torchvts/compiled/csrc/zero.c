@@ -4,7 +4,7 @@
 /* Grids of cells and sums of one frame. */
 typedef struct {
     int rows, columns, n, pairs_y, pairs_x, unknowns;
-    double *depth, *weight, *pressure, *offset, *unchanged, *pit, *stiff; /* of n cells */
+    double *depth, *weight, *pressure, *sums, *unchanged, *pit, *stiff; /* of n cells; sums: what enters one */
     double *line, *lines, *by_pressure, *others, *system, *right, *found; /* line: of `width` values */
 } Work;
 
@@ -88,14 +88,14 @@ static WIDE FUSED void multiply_add(const double *factors, int lines, int n, con
     }
 }
 
-/* Sums over cells of fields (rows, columns) times each pair of terms: by_pressure of `unchanged`, others of `pit` and of `stiff` with slopes. */
-static void sum_products(const Plan *plan, const Work *at, const double *pit) {
+/* Sums over cells of fields (rows, columns) times each pair of terms: by_pressure of `unchanged`, others of `sums` and of `stiff` with slopes. */
+static void sum_products(const Plan *plan, const Work *at) {
     const size_t size = (size_t)at->pairs_y * at->columns;
     const int p = at->pairs_y, q = at->pairs_x, h = at->rows, w = at->columns;
     memset(at->lines, 0, sizeof(double) * size);
     multiply_add(plan->pairs_y, p, h, at->unchanged, w, at->lines), multiply_add(at->lines, p, w, plan->pairs_x, q, at->by_pressure);
     memset(at->lines, 0, sizeof(double) * size);
-    multiply_add(plan->pairs_y, p, h, pit, w, at->lines), multiply_add(plan->slope_pairs_y, p, h, at->stiff, w, at->lines);
+    multiply_add(plan->pairs_y, p, h, at->sums, w, at->lines), multiply_add(plan->slope_pairs_y, p, h, at->stiff, w, at->lines);
     multiply_add(at->lines, p, w, plan->pairs_x, q, at->others);
     memset(at->lines, 0, sizeof(double) * size);
     multiply_add(plan->pairs_y, p, h, at->stiff, w, at->lines), multiply_add(at->lines, p, w, plan->slope_pairs_x, q, at->others);
@@ -186,12 +186,12 @@ static void fit_offset(const Plan *plan, const Work *at, double reach) {
         at->stiff[k] = plan->smooth_mm * plan->smooth_mm * (1.0 + plan->stiff * deep * deep);
     }
     memset(at->by_pressure, 0, sizeof(double) * 2 * pairs);
-    for (int k = 0; k < at->n; k++) at->offset[k] = at->pit[k] + 1e-6;
-    sum_products(plan, at, at->offset);
+    for (int k = 0; k < at->n; k++) at->sums[k] = at->pit[k] + 1e-6;
+    sum_products(plan, at);
     fill_system(plan, at);
-    for (int k = 0; k < at->n; k++) at->unchanged[k] *= at->pressure[k], at->offset[k] = at->pit[k] * at->depth[k];
+    for (int k = 0; k < at->n; k++) at->unchanged[k] *= at->pressure[k], at->sums[k] = at->pit[k] * at->depth[k];
     project(plan, at, at->unchanged, at->line, at->right);
-    project(plan, at, at->offset, at->line, at->found);
+    project(plan, at, at->sums, at->line, at->found);
     for (int k = 0; k < at->unknowns; k++) at->right[k] = -(at->right[k] * plan->by_pressure[k] + at->found[k]);
     solve(at->system, at->right, at->unknowns);
     memcpy(at->found, at->right, sizeof(double) * (size_t)at->unknowns);
@@ -225,6 +225,7 @@ int zero_background(const Plan *plan, Scratch *scratch, const float *weight, flo
     const int cell = (int)plan->zero_cell, rows = (int)plan->height / cell, columns = (int)plan->width / cell;
     const int ky = (int)plan->waves_y, kx = (int)plan->waves_x, n = rows * columns, unknowns = ky * kx;
     const size_t pairs = (size_t)(ky * (ky + 1) / 2) * (kx * (kx + 1) / 2);
+    /* seven grids of n cells; `some` of start_of, of the room of one; then the rest of Work */
     const size_t size = 8 * (size_t)n + (size_t)plan->width + (size_t)(ky * (ky + 1) / 2) * columns + 2 * pairs + (size_t)unknowns * (unknowns + 2) + (size_t)plan->width + (size_t)kx;
     const size_t before = scratch->used;
     double *memory = lend(scratch, sizeof(double) * size);

@@ -252,7 +252,10 @@ def test_a_video_that_is_cut_short_is_named(unit, tmp_path):
     content = whole.read_bytes()
     whole.write_bytes(content[: int(0.6 * len(content))])
     report = reconstruct_dataset(unit, tmp_path / "in", tmp_path / "out", pictures=False, background_frames=0)
-    assert any("cut short? it announces 40 frames" in note for _, note in report.notes) and report.rows < 30
+    assert [name for name, text in report.failed if "cut short? it announces 40 frames" in text] == [
+        "film.avi"
+    ] and report.rows < 30
+    assert reconstruct_dataset(unit, tmp_path / "in", tmp_path / "out", pictures=False, background_frames=0).failed == report.failed
 
 
 def test_the_script_ends_with_status_1_where_a_frame_was_left_out(unit, tmp_path, run_script):

@@ -141,6 +141,8 @@ TRIGGERS = {
     # the background of now
     "contact_in_background": pressed_background,
     "light_changed": changed(uneven, of_background=True),
+    "channels_swapped, of now": changed(lambda image: image[[2, 1, 0]], of_background=True),
+    "no_picture, of now": changed(lambda image: 0.1 * image, of_background=True),
     # the camera
     "few_bits": gallery("few bits", 5.0),
     "compressed": gallery("JPEG", 70.0),
@@ -148,6 +150,8 @@ TRIGGERS = {
     "led_failed": gallery("dead lights", 1.0),
     "no_picture": changed(lambda image: torch.full_like(image, 0.5)),
     "no_picture, all black": changed(lambda image: torch.zeros_like(image)),
+    "no_picture, dark": changed(lambda image: (0.05 * image * 255.0).round() / 255.0),
+    "no_picture, grey": changed(lambda image: image.mean(0, keepdim=True).expand(3, -1, -1).clone()),
     "other_view": mirrored,
     "channels_swapped": changed(lambda image: image[[2, 1, 0]]),
     "channels_swapped, at calibration too": gallery("channel order", 1.0),

@@ -141,6 +141,18 @@ def test_surfaces_that_slide_on_themselves_are_ambiguous(shape, names, ends):
     assert found.covariance.diagonal().max() > 1.0 and torch.linalg.eigvalsh(found.covariance).min() > 0
 
 
+def test_a_pose_that_is_told_again_and_again_does_not_drift_along_what_is_unknown(mini_presses, mini_by_prior):
+    """Balls beside the middle of the image, each pose the start of the next: up to 0.6 mm along z, which slopes do not see."""
+    pipe, generator = vts.DepthPipeline.from_calibration(mini_by_prior, "fast").freeze(), torch.Generator().manual_seed(0)
+    for press in mini_presses[1][0:30:10]:
+        seen, told = pipe(press.image[None]), torch.eye(4, dtype=torch.float64)
+        for _ in range(4):
+            noisy = (press.image + torch.randn(press.image.shape, generator=generator) / 255.0).clamp(0.0, 1.0)
+            found = vts.register_depth(pipe(noisy[None]), seen, mini_by_prior.sensor.mm_per_pixel, initial=told)
+            told = found.T_target_source
+            assert found.converged and abs(float(told[2, 3])) < 0.02 and found.rmse_mm < 0.02
+
+
 def hanging_ball(x0, y0, press, seed):
     """A ball as a sensor shows it: the skin leaves it at a slope of 0.6 and sinks slowly, and slopes are off by 0.03."""
 

@@ -14,6 +14,7 @@ import argparse
 import dataclasses
 import json
 from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,7 @@ from tqdm import tqdm
 
 from ..core.checks import in_one_line
 from ..core.files import read_image, rgb_from_bgr
-from ..core.recordings import count_frames, is_film, raw_frames
+from ..core.recordings import RawFrame, count_frames, cut_short, is_film, raw_frames
 from ..dataset import list_items
 from ..diagnose import SEVERITIES, Finding, diagnose
 from ..diagnose.findings import COST_DEG
@@ -77,13 +78,19 @@ def of_recording(arguments: argparse.Namespace, background: Tensor | None, calib
     total = sum(count_frames(item.file) if item.is_film else 1 for item in items)
     if total == 0:
         raise ValueError(f"{arguments.image}: expected images or videos, got none in this folder")
-    frames = (
-        (item.frame_name(k if item.is_film else -1), frame) for item in items for k, frame in enumerate(raw_frames(item.file))
-    )
     every = -(-total // MOST) if total > MOST else 1
     found: dict[str, list[tuple[str, Finding]]] = {}
+
+    def frames() -> Iterator[tuple[str, RawFrame]]:
+        for item in items:
+            number = -1
+            for number, frame in enumerate(raw_frames(item.file)):
+                yield item.frame_name(number if item.is_film else -1), frame
+            if item.is_film and (text := cut_short(item.file, number + 1)):
+                found.setdefault("unreadable", []).append((item.path, Finding("unreadable", text, "fault", 1.0)))
+
     count = clean = 0
-    for number, (name, frame) in enumerate(tqdm(frames, total=total, desc="diagnosing", leave=False, disable=None)):
+    for number, (name, frame) in enumerate(tqdm(frames(), total=total, desc="diagnosing", leave=False, disable=None)):
         if number % every:
             continue
         count += 1
@@ -95,17 +102,18 @@ def of_recording(arguments: argparse.Namespace, background: Tensor | None, calib
         for finding in findings:
             found.setdefault(finding.name, []).append((name, finding))
     rows = [summed(same) for same in found.values()]
+    ok = clean == count and "unreadable" not in found
     rows.sort(key=lambda row: (sum(COST_DEG[name] * n for name, n in row["severities"].items()), len(row["frames"])), reverse=True)
     if arguments.json:
-        print(json.dumps({"ok": clean == count, "frames": count, "of": total, "findings": rows}, indent=1))
-        return 0 if clean == count else 1
+        print(json.dumps({"ok": ok, "frames": count, "of": total, "findings": rows}, indent=1))
+        return 0 if ok else 1
     looked = f"{count} frames" if every == 1 else f"{count} of {total} frames"
     print(f"{looked}: {clean} without a warning or a fault")
     for row in rows:
         shares = ", ".join(f"{severity} in {n}" for severity, n in row["severities"].items())
         print(f"{shares} of {count}, such as {row['frames'][0]}: {row['message']} [{row['name']}]")
-    print(next_step(arguments.calibration, arguments.image, clean == count))
-    return 0 if clean == count else 1
+    print(next_step(arguments.calibration, arguments.image, ok))
+    return 0 if ok else 1
 
 
 def summed(same: list[tuple[str, Finding]]) -> dict[str, Any]:

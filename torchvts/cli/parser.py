@@ -44,7 +44,8 @@ class Parser(argparse.ArgumentParser):
         """Raise with the message, the option that was probably meant, and where the options are explained."""
         if message.startswith("unrecognized arguments: "):
             word = message.split()[2]
-            message = f"unknown option {word!r}{suggest(word, self._option_string_actions)}"
+            kind = "unknown option" if word.startswith("-") else "one argument too many:"
+            message = f"{kind} {word!r}{suggest(word, self._option_string_actions)}"
         raise UsageError(f"{message} ({self.prog} --help explains)")
 
     def _check_value(self, action: argparse.Action, value: Any) -> None:

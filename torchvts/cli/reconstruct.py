@@ -19,6 +19,7 @@ from pathlib import Path
 from tqdm import tqdm
 
 from ..core.arrays import Array
+from ..core.checks import check_integer
 from ..core.files import make_folder
 from ..core.recordings import is_film
 from ..dataset import CLOUD_FORMATS, FORMATS, PICTURES_UP_TO, RunReport, list_items, reconstruct_dataset
@@ -67,6 +68,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Reconstruct, and print a summary."""
+    check_integer("--every", arguments.every, 1)
     unit, names = split_files(arguments)
     inputs = [Path(name) for name in names]
     calibration = Path(arguments.files[0])
@@ -86,7 +88,7 @@ def run(arguments: argparse.Namespace) -> int:
     findings = diagnose_some(unit, inputs, report, arguments.every)
     for name, finding in findings:
         print(f"{name}: {finding}")
-    wrong = [name for name, _ in [*findings, *report.failed, *report.doubted]]
+    wrong = bool(findings or report.failed or report.doubted)
     faults = any(finding.severity == "fault" for _, finding in findings)
     return ended(unit.metric, report.failed or report.doubted or faults, next_step(calibration, inputs, arguments, wrong))
 
@@ -109,16 +111,20 @@ def write_sheet(unit: Calibration, inputs: list[Path], arguments: argparse.Names
             shown.append((item.path[-NAME_SHOWN:], depth, recording.doubt))
     if len(shown) > 1 and max(depth.max() for _, depth, _ in shown) > 0.0:
         make_folder(path.parent)
-        title = f"the first {len(shown)} of {len(items)} images"
+        few = min(SHEET, len(items))
+        left_out = f", {few - len(shown)} of them left out" if few > len(shown) else ""
+        title = f"the first {few} of {len(items)} images{left_out}"
         save_figure(sheet_figure(shown, unit.sensor.mm_per_pixel, title, unit.metric, warnings_of(unit.report)), path)
         print(f"wrote {path}: {title} in one scale", flush=True)
 
 
-def next_step(calibration: Path, inputs: list[Path], arguments: argparse.Namespace, wrong: list[str]) -> str:
-    """What to do after a run in which these frames have findings, were left out, or are in doubt."""
+def next_step(calibration: Path, inputs: list[Path], arguments: argparse.Namespace, wrong: bool) -> str:
+    """What to do after a run in which frames have findings, were left out, or are in doubt, or none."""
     if wrong:
-        return f"torchvts diagnose {calibration} {inputs[0]} says what is wrong, the docs/diagnose.md page what to do"
-    return f"{arguments.out / 'summary.json'} says what the files are; vts.read_result(path) reads those ending in .npz"
+        image = inputs[0] if len(inputs) == 1 else "IMAGE"
+        return f"torchvts diagnose {calibration} {image} says what is wrong, the docs/diagnose.md page what to do"
+    reads = "; vts.read_result(path) reads those ending in .npz" if arguments.format == "npz" else ""
+    return f"{arguments.out / 'summary.json'} says what the files are{reads}"
 
 
 def calibrate_first(arguments: argparse.Namespace, inputs: list[Path], unit: Sensor) -> tuple[Path, Calibration]:

@@ -25,5 +25,6 @@ DARKEST = 0.02
 def bits_of(most: float) -> str:
     """What an image whose largest value is this was perhaps read as, such as 12 bits in 16; "" where it has all of its range."""
     level = round(65535 * most)
-    bits = next((bits for bits in (10, 12) if 0 < level < 2**bits), 0)
+    of_8_bits = abs(255.0 * most - round(255.0 * most)) < 1e-4  # one in 257 of 16 bits, too
+    bits = 0 if of_8_bits else next((bits for bits in (10, 12) if 0 < level < 2**bits), 0)
     return f"its largest value is {level} of 65535: {bits} bits stored in 16? or no light" if bits and most > 0.5 * BLACK else ""

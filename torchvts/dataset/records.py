@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from ..core.files import naming, write_atomically
+from ..core.recordings import cut_short
 from ..core.results import join_results
 from ..core.zarr_results import join_as_zarr
 from .items import FORMATS, PARTS, STATE, VIDEO_FORMATS, Item, Source, list_items, one_line
@@ -123,6 +124,8 @@ class Records:
             nonlocal count
             for item in list_items(self.source, self.settings.every):
                 length = self.length(item) if item.is_film else None
+                if length is not None and (text := cut_short(item.file, length)):
+                    failed.append((item.path, text))
                 for frame in (-1,) if length is None else range(0, length, self.settings.every):
                     name, record = item.frame_name(frame), self.read(item, frame)
                     if record is None:

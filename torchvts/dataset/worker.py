@@ -18,7 +18,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from ..core.checks import NAMED, in_one_line
-from ..core.recordings import count_frames, cut_short
+from ..core.recordings import count_frames
 from ..model import Calibration
 from ..pipeline import DepthOutput
 from ..skin import ContactSettings
@@ -38,7 +38,7 @@ class RunReport(NamedTuple):
         rows: frames in the table.
         before: how many of them an earlier run had done.
         failed: (name, reason) of the frames that were left out.
-        notes: (name, text) of what else is to be known: videos whose first frames were not used, or that are cut short.
+        notes: (name, text) of what else is to be known: videos whose first frames were not used.
         doubted: (name, doubt) of the frames in which less may have been seen than is there.
     """
 
@@ -80,8 +80,6 @@ class Worker:
         loader = Loader(self.records, self.sensor, self.share, self._begin)
         with tqdm(total=total, unit="frame", disable=rank > 0 or None, smoothing=0.05) as bar, ThreadPoolExecutor(writers) as pool:
             for frame in loader.frames(workers):
-                if frame.length is not None and (text := cut_short(frame.item.file, frame.length)):
-                    self.notes.append((frame.item.path, text))
                 if frame.done:
                     bar.update()
                 else:

@@ -134,7 +134,7 @@ def _contact(mask: torch.Tensor) -> float | None:
 
 def _contact_in_background(e: Examination) -> float | None:
     light = _light_of_background(e)  # what light in another place makes looks like a contact
-    if e.given is None or light is None or light["uneven"] > UNEVEN or e.failed_in(e.given) or e.check.flaw(e.given[None]):
+    if e.given is None or light is None or light["uneven"] > UNEVEN or e.failed_in(e.given):
         return None
     with torch.no_grad():
         return _contact(e.pipeline(e.given[None].to(e.unit.background.dtype)).contact)
@@ -178,18 +178,19 @@ def _noise(e: Examination) -> Figures | None:
     return {"value": float(e.noise.max()), "cost": e.noise_deg, "ratio": ratio} if ratio > 3.0 or e.noise_deg > FAULT_DEG else None
 
 
-def _unusable(e: Examination) -> Finding | None:
-    flaw = e.check.flaw(e.raw[None])
+def _unusable(e: Examination, image: torch.Tensor | None, what: str) -> Finding | None:
+    flaw = None if image is None else e.check.flaw(image[None])
     if flaw is None or flaw.name == "shows_more":  # a contact over all of the skin looks so, too
         return None
     name, remedy = FINDINGS.get(flaw.name, ("no_picture", ""))
-    return Finding(name, f"the frame {flaw.text}{remedy}", "fault", 1.0)
+    return Finding(name, f"the {what} {flaw.text}{remedy}", "fault", 1.0)
 
 
 def _failed(e: Examination, image: torch.Tensor | None) -> Figures:
-    """Number of the channels that an image has lost; of a frame that has lost all :func:`_unusable` says more."""
+    """Number of the channels that an image has lost; of an image without light :func:`_unusable` says more."""
     failed = [] if image is None else e.failed_in(image)
-    failed = [] if len(failed) == len(CHANNELS) and image is e.image else failed
+    if image is not None and failed and (flaw := e.check.flaw(image[None])) is not None and flaw.name in ("one_colour", "dark"):
+        failed = []
     rough = "with two LEDs left mode precise still finds a rough depth, with one none does"
     left = "the response of this unit needs all of them" if e.unit.lights is None else rough
     return {"value": float(len(failed)), "colors": " and ".join(CHANNELS[j] for j in failed), "left": left}
@@ -217,7 +218,7 @@ def _change_of(conditions: Conditions | None) -> Figures | None:
 
 
 def _light_of_background(e: Examination) -> Figures | None:
-    return None if e.given is None else _change_of(e.conditions_of(e.given))
+    return None if e.given is None or e.check.flaw(e.given[None]) else _change_of(e.conditions_of(e.given))
 
 
 def _light_at_calibration(e: Examination) -> Figures | Finding | None:
@@ -368,6 +369,7 @@ CHECKS = (
     # the background of now
     Check("led_failed", lambda e: _failed(e, e.given), "the {colors} LED has failed (its channel of the background is black "
           "everywhere): check LED and cable; {left}", "fault", above=0.0),
+    Check("no_picture", lambda e: _unusable(e, e.given, "background")),
     Check("contact_in_background", _contact_in_background, _CONTACT.format("background", "in the calibration's"), "fault"),
     Check("light_changed", _light_of_background, "the background's light is {levels} of that at calibration, uneven by "
           "{uneven:.1%}: what is smooth is divided out", _by_unevenness, above=LIGHT_REPORTED),
@@ -382,7 +384,7 @@ CHECKS = (
           "more light, less gain, or average several frames", lambda figures: by_cost(0.5 * figures["cost"])),
     Check("led_failed", lambda e: _failed(e, e.image), "the {colors} LED has failed (its channel is black everywhere): check LED "
           "and cable; {left}", "fault", above=0.0, last=True),
-    Check("no_picture", _unusable, last=True),
+    Check("no_picture", lambda e: _unusable(e, e.raw, "frame"), last=True),
     Check("saturated", _saturated, "the image is saturated in {where}: reduce the exposure",
           lambda figures: "note" if figures["value"] < 0.1 else "fault" if figures["inside"] > 0.3 else "warning", above=0.02),
     # the light and the skin

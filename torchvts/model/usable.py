@@ -24,7 +24,8 @@ class Flaw(NamedTuple):
     """Why an image cannot be used.
 
     Attributes:
-        name: of the check: "one_colour", "dark", "cut_short", "overexposed", or how the view is another: "swapped", "turned",
+        name: of the check: "one_colour", "dark", "overexposed", "no_colour", "cut_short",
+            or how the view is another: "swapped", "turned",
             "shows_more", "shows_less".
         text: what it does or is, such as "is dark, 6% of the background's brightness: black, or the LEDs were off".
     """
@@ -105,6 +106,13 @@ def dark(check: FrameCheck, image: Array, cells: Array) -> Flaw | None:
     return Flaw("dark", f"is dark, {level:.0%} of the background's brightness: {bits or 'black, or the LEDs were off'}")
 
 
+def no_colour(check: FrameCheck, image: Array, cells: Array) -> Flaw | None:
+    """All channels are the same."""
+    if float((cells.max(0) - cells.min(0)).max()) >= BLACK or float(np.ptp(check.background, axis=0).max()) < LIT:
+        return None
+    return Flaw("no_colour", "has no colour: all channels are the same; record in colour")
+
+
 def cut_short(check: FrameCheck, image: Array, cells: Array) -> Flaw | None:
     """Rows or columns did not arrive."""
     brightest, spread = _lines(image)
@@ -129,7 +137,14 @@ def other_view(check: FrameCheck, image: Array, cells: Array) -> Flaw | None:
     return None if view is None else Flaw(view.name, view.in_words())
 
 
-CHECKS: tuple[Callable[[FrameCheck, Array, Array], Flaw | None], ...] = (one_colour, dark, overexposed, cut_short, other_view)
+CHECKS: tuple[Callable[[FrameCheck, Array, Array], Flaw | None], ...] = (
+    one_colour,
+    dark,
+    overexposed,
+    no_colour,
+    cut_short,
+    other_view,
+)
 """What is asked of an image, (3, H, W), and its means over cells, in this order."""
 
 

@@ -192,7 +192,7 @@ def equal_poses(keyframe: Keyframe, frame: Grids, starts: list[Array], motions: 
         if one.names:  # products of symmetries would differ by what is unknown: only what turns it otherwise is another pose
             poses = [*(one.pose @ motion for motion in motions), *waiting]
             others = [follow(keyframe, frame, [poses[k]]) for k in turned_otherwise(poses, one)]
-            others = [other for other in others if not other.misfit]
+            others = [other for other in others if not other.misfit and is_new(other.pose, known)]
             found += [others[k] for k in turned_otherwise([other.pose for other in others], one)]
             break
         if not known:

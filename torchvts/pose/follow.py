@@ -10,11 +10,11 @@ from .grids import Grids
 from .height_errors import WHITE_MM, covariance_with_heights, height_sums
 from .inverse import (
     LEAST_SLOPE_NOISE,
-    ROTATION_FIRST,
     SLOPE_NOISE,
     Score,
     Sums,
     bare_points,
+    beside,
     moved_by,
     refine,
     score_pose,
@@ -154,9 +154,7 @@ def _kept(keyframe: Keyframe, unknown: Array, last: Array, pose: Array) -> Array
     """The pose (4, 4), moved by what is unknown to where that has its last value, as :func:`solve_step` has it: rotations first."""
     if unknown.shape[1] == 0:
         return pose
-    step = step_between(keyframe.many, last, pose)
-    damping = unknown.T * ROTATION_FIRST
-    kept: Array = last @ moved_by(keyframe.many, step - unknown @ np.linalg.solve(damping @ unknown, damping @ step))
+    kept: Array = last @ moved_by(keyframe.many, beside(unknown) @ step_between(keyframe.many, last, pose))
     return kept
 
 

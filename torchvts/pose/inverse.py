@@ -206,14 +206,22 @@ def solve_step(sums: Sums, held: Array | None = None) -> Array:
 
     What they do not determine is chosen by :data:`ROTATION_FIRST`: a ball that moves sideways is followed by a shift, no roll.
     """
-    matrix, right = sums.matrix, sums.right
-    if held is not None and held.shape[1] > 0:
-        known = np.eye(6) - held @ held.T
-        matrix, right = known @ matrix @ known, known @ right
+    known = np.eye(6) if held is None else beside(held)
+    matrix, right = known.T @ sums.matrix @ known, known.T @ sums.right
     damping = 1e-6 * max(float(np.trace(matrix)), 1e-9)
     step: Array = -np.linalg.solve(matrix + damping * np.diag(ROTATION_FIRST), right)
     step *= min(1.0, LARGEST_STEP_MM / max(float(np.linalg.norm(step)), 1e-12))
     return step
+
+
+def beside(held: Array) -> Array:
+    """(6, 6), which takes from a scaled twist what it has of orthonormal ones (6, k), so that it turns least.
+
+    Steps that are made otherwise than they are asked for never end: slopes ask for a shift along z, which they do not see.
+    """
+    weighted = held.T * ROTATION_FIRST
+    matrix: Array = np.eye(6) - held @ np.linalg.solve(weighted @ held, weighted)
+    return matrix
 
 
 def moved_by(points: Points, step: Array) -> Array:

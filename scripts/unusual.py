@@ -6,6 +6,7 @@ python scripts/unusual.py --cases "tiny balls" "reach times 3" --seeds 100
 
 import dataclasses
 import json
+import math
 import random
 import shlex
 import sys
@@ -15,14 +16,16 @@ from pathlib import Path
 from typing import NamedTuple
 
 import torch
+from torch import Tensor
 from tqdm import tqdm
 
 from lab.commands import main_of, parser_of
-from lab.drawn_sensors import DrawnSensor, drawn_sensor
+from lab.drawn_sensors import DrawnPress, DrawnSensor, drawn_sensor
 from lab.rows import write_files
 from torchvts import ConfidentPipeline, Press, Sensor, calibrate
 from torchvts.core.tables import markdown
 from torchvts.model.report import warnings_of
+from torchvts.scenes import objects
 
 PRESSES = 5
 SEEDS = (100, 101, 102)
@@ -98,6 +101,21 @@ BALLS = {
 """Name, diameters of balls as shares of the image's shorter side, and depths as shares of the diameter, from and to."""
 
 
+COINS = {f"coins over {share:.0%} of the view": share for share in (0.4, 0.5, 0.6)}
+"""Name, and the share of the skin on which a flat round face lies."""
+
+
+def coin(unit: DrawnSensor, share: float) -> DrawnPress:
+    """A coin in the middle of the view, pressed in by 4 % of the image's shorter side."""
+    wide, high = (n * unit.sensor.mm_per_pixel for n in (unit.sensor.width, unit.sensor.height))
+    radius_mm = math.sqrt(share * wide * high / math.pi)
+
+    def height_mm(x: Tensor, y: Tensor) -> Tensor:
+        return -30.0 * (torch.hypot(x, y) - radius_mm).clamp_min(0.0)
+
+    return unit.press(height_mm, objects.pose(press_mm=0.04 * min(wide, high)), "coin", 300)
+
+
 def presses_of(unit: DrawnSensor, name: str, seed: int) -> list[Press]:
     """Five presses without labels."""
     chance = random.Random(seed)
@@ -131,7 +149,7 @@ def measured(name: str, seed: int) -> Found:
     except ValueError as error:
         return Found(name, seed, [str(error)], {})
     pipe, rows = ConfidentPipeline.from_calibration(calibration, "fast"), []
-    for pressed in unit.objects:
+    for pressed in [coin(unit, COINS[name])] if name in COINS else unit.objects:
         with torch.no_grad():
             out = pipe(pressed.image[None])
         true, inside = pressed.scene, pressed.scene.contact
@@ -161,7 +179,7 @@ def row_of(name: str, found: Sequence[Found]) -> list[str]:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    names = (*CASES, *BALLS)
+    names = (*CASES, *BALLS, *COINS)
     parser = parser_of(__doc__)
     parser.add_argument("--cases", nargs="+", default=names, choices=names, metavar="CASE", help=f"of {', '.join(names)}")
     parser.add_argument("--seeds", nargs="+", type=int, default=SEEDS, metavar="SEED", help="of the drawn sensors")

@@ -35,7 +35,7 @@ def find_background(images: Tensor, sensor: Sensor | None = None) -> Tensor:
 
     The image is the median over the frames, averaged with the half of the values next to it. Refused are changing light, movement,
     and structure between the channels: the fall-off of an LED is smooth, and a spot is dark in all channels; a contact is bright in
-    one channel where it is dark in another. docs/streaming.md has the limits. A faint contact in all frames is not found.
+    one channel where it is dark in another. Limits: :data:`MOVED`, :data:`ROUGH_DEG`. A faint contact in all frames is not found.
 
     Args:
         images: (N, 3, H, W) in [0, 1], rectified, at least 3.

@@ -167,7 +167,9 @@ class Calibration:
         check_sensor("sensor", sensor)
         sensor = dataclasses.replace(sensor, gamma=sensor.exponent, prior=None)
         frozen = PointLights(*(t.detach().cpu() for t in (lights.position_mm, lights.albedo, lights.gloss))).requires_grad_(False)
-        summary = read_report({"model": "point_lights", "source": "given", "doubts": []} | dict(report or {}), "report")
+        summary = read_report(
+            {"model": "point_lights", "source": "given", "doubts": []} | ({} if report is None else dict(report)), "report"
+        )
         if ambient is not None:
             check_shape("ambient", ambient, (3,))
             ambient = ambient.detach().cpu().to(frozen.position_mm.dtype)
@@ -208,7 +210,9 @@ class Calibration:
         check_record("response", response, ResponseModel, "a sensor's prior has one: sensor.prior.response")
         check_sensor("sensor", sensor)
         sensor = dataclasses.replace(sensor, gamma=response.gamma, blur_px=response.blur_px, prior=None)
-        summary = read_report({"model": "response", "source": "given", "doubts": []} | dict(report or {}), "report")
+        summary = read_report(
+            {"model": "response", "source": "given", "doubts": []} | ({} if report is None else dict(report)), "report"
+        )
         light, noise, markers, printed = _measure(background, sensor)
         if covariance is not None:
             check_shape("covariance", covariance, (response.field.size(),) * 2, "one row for each coefficient of a slope")

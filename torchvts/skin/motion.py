@@ -119,6 +119,8 @@ class SkinMotion(nn.Module):
             )
         distance = torch.cdist(dots, dots)
         self.spacing_px = float(distance.topk(2, largest=False).values[:, 1].median())
+        if self.spacing_px <= 0.0:
+            raise ValueError("dots_px: expected places that differ, got most of them twice: find_dots gives each once")
         self.knows_camera = camera_mm is not None
         x, y, height = (0.0, 0.0, math.inf) if camera_mm is None else check_camera(camera_mm)
         self.agrees, self.most_px = AGREES, 0.3 * self.diameter_px

@@ -123,7 +123,7 @@ def next_step(calibration: Path, inputs: list[Path], arguments: argparse.Namespa
     if wrong:
         image = inputs[0] if len(inputs) == 1 else "IMAGE"
         return f"torchvts diagnose {calibration} {image} says what is wrong, the docs/diagnose.md page what to do"
-    reads = "; vts.read_result(path) reads those ending in .npz" if arguments.format == "npz" else ""
+    reads = "; vts.read_result(path) reads those ending in .npz" if arguments.format in ("npz", "video-npz") else ""
     return f"{arguments.out / 'summary.json'} says what the files are{reads}"
 
 

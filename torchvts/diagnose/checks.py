@@ -15,7 +15,7 @@ from ..core.levels import SATURATED
 from ..model.markers import FEWEST_DOTS
 from ..model.stated_error import stated_deg, stated_error_deg
 from ..model.summary import SATURATED_SHARE
-from ..model.usable import FrameCheck
+from ..model.usable import Flaw, FrameCheck
 from ..pipeline import UNEVEN, UNSEEN_DEG, DepthPipeline, usual_unseen_deg
 from .camera import blockiness, levels_of, new_spots, pattern_likeness, texture_share
 from .examination import MISFITS, Examination
@@ -178,19 +178,17 @@ def _noise(e: Examination) -> Figures | None:
     return {"value": float(e.noise.max()), "cost": e.noise_deg, "ratio": ratio} if ratio > 3.0 or e.noise_deg > FAULT_DEG else None
 
 
-def _unusable(e: Examination, image: torch.Tensor | None, what: str) -> Finding | None:
-    flaw = None if image is None else e.check.flaw(image[None])
+def _unusable(flaw: Flaw | None, what: str) -> Finding | None:
     if flaw is None or flaw.name == "shows_more":  # a contact over all of the skin looks so, too
         return None
     name, remedy = FINDINGS.get(flaw.name, ("no_picture", ""))
     return Finding(name, f"the {what} {flaw.text}{remedy}", "fault", 1.0)
 
 
-def _failed(e: Examination, image: torch.Tensor | None) -> Figures:
+def _failed(e: Examination, image: torch.Tensor | None, flaw: Flaw | None) -> Figures:
     """Number of the channels that an image has lost; of an image without light :func:`_unusable` says more."""
-    failed = [] if image is None else e.failed_in(image)
-    if image is not None and failed and (flaw := e.check.flaw(image[None])) is not None and flaw.name in ("one_colour", "dark"):
-        failed = []
+    lit = image is not None and (flaw is None or flaw.name not in ("one_colour", "dark"))
+    failed = e.failed_in(image) if image is not None and lit else []
     rough = "with two LEDs left mode precise still finds a rough depth, with one none does"
     left = "the response of this unit needs all of them" if e.unit.lights is None else rough
     return {"value": float(len(failed)), "colors": " and ".join(CHANNELS[j] for j in failed), "left": left}
@@ -218,7 +216,7 @@ def _change_of(conditions: Conditions | None) -> Figures | None:
 
 
 def _light_of_background(e: Examination) -> Figures | None:
-    return None if e.given is None or e.check.flaw(e.given[None]) else _change_of(e.conditions_of(e.given))
+    return None if e.given is None or e.flaw_of_given else _change_of(e.conditions_of(e.given))
 
 
 def _light_at_calibration(e: Examination) -> Figures | Finding | None:
@@ -367,9 +365,9 @@ CHECKS = (
     Check("lights_misfit", _light_at_calibration, "the calibration's lights do not explain its own image ({levels}; uneven by "
           "{uneven:.1%}): other lights, stray light, or a lens; use presses or a prior", above=LIGHT_REPORTED),
     # the background of now
-    Check("led_failed", lambda e: _failed(e, e.given), "the {colors} LED has failed (its channel of the background is black "
-          "everywhere): check LED and cable; {left}", "fault", above=0.0),
-    Check("no_picture", lambda e: _unusable(e, e.given, "background")),
+    Check("led_failed", lambda e: _failed(e, e.given, e.flaw_of_given), "the {colors} LED has failed (its channel of the "
+          "background is black everywhere): check LED and cable; {left}", "fault", above=0.0),
+    Check("no_picture", lambda e: _unusable(e.flaw_of_given, "background")),
     Check("contact_in_background", _contact_in_background, _CONTACT.format("background", "in the calibration's"), "fault"),
     Check("light_changed", _light_of_background, "the background's light is {levels} of that at calibration, uneven by "
           "{uneven:.1%}: what is smooth is divided out", _by_unevenness, above=LIGHT_REPORTED),
@@ -382,9 +380,9 @@ CHECKS = (
           lambda figures: by_cost(figures["cost"])),
     Check("noise", _noise, "noise of {value:.3f}, {ratio:.1f} times that at calibration, changes normals by {cost:.1f} degrees: "
           "more light, less gain, or average several frames", lambda figures: by_cost(0.5 * figures["cost"])),
-    Check("led_failed", lambda e: _failed(e, e.image), "the {colors} LED has failed (its channel is black everywhere): check LED "
-          "and cable; {left}", "fault", above=0.0, last=True),
-    Check("no_picture", lambda e: _unusable(e, e.raw, "frame"), last=True),
+    Check("led_failed", lambda e: _failed(e, e.image, e.flaw), "the {colors} LED has failed (its channel is black everywhere): "
+          "check LED and cable; {left}", "fault", above=0.0, last=True),
+    Check("no_picture", lambda e: _unusable(e.flaw, "frame"), last=True),
     Check("saturated", _saturated, "the image is saturated in {where}: reduce the exposure",
           lambda figures: "note" if figures["value"] < 0.1 else "fault" if figures["inside"] > 0.3 else "warning", above=0.02),
     # the light and the skin

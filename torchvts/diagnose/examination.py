@@ -16,7 +16,7 @@ from ..core.levels import BRIGHT, DARKEST, LIT
 from ..core.noise import noise_std
 from ..model import Calibration
 from ..model.lights import inverse_light_matrix
-from ..model.usable import FrameCheck
+from ..model.usable import Flaw, FrameCheck
 from ..pipeline import DepthPipeline
 from ..skin import DotMotion, motion_of_unit
 from ..skin.weight import WEIGHT_CELLS, spread_of
@@ -132,6 +132,16 @@ class Examination:
     def check(self) -> FrameCheck:
         """Compares images with the background."""
         return FrameCheck(self.value)
+
+    @cached_property
+    def flaw(self) -> Flaw | None:
+        """Why the image cannot be used."""
+        return self.check.flaw(self.raw[None])
+
+    @cached_property
+    def flaw_of_given(self) -> Flaw | None:
+        """Why the image without contact cannot be used."""
+        return None if self.given is None else self.check.flaw(self.given[None])
 
     def failed_in(self, image: Tensor) -> list[int]:
         """Channels that are black everywhere in an image (3, H, W), and were not at calibration."""
